@@ -25,8 +25,8 @@ from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.simulation.integration_plan import sample_times
 
 PATH_UNITS = {"m", "m/s", "s", "m/s^2"}  # of numbers of a load on which its path may depend
-# Runs on one path, about, in a batch: many more exceed the cache of the processor. They are split
-# evenly, as runs that fill a batch up take as long as others.
+# Target and largest number of runs of a batch: many more exceed the cache of the processor. Runs
+# are split evenly, as padding runs take as long as others.
 BATCH_SIZE, MAX_BATCH_SIZE = 256, 384
 
 # Numbers that decide the order of positions, or the degrees and parts of a beam not uniform.
@@ -35,11 +35,12 @@ POSITION_ADDRESS = re.compile(
     r"|(supports|actuators)\.(\d+|\*)\.(position|start|end)"
 )
 
-# Number of the profile of a run among those of a sweep: changes what drives the wheels only.
+# Address of the number of a run's profile, in a sweep over profiles. It changes the excitation of
+# the wheels only.
 PROFILE_NUMBER = "profile"
-MOST_PROFILES = 64  # runs of a batch whose profiles differ: what they feel in each step is kept
+MOST_PROFILES = 64  # runs of a batch with profiles of their own, as profile values are stored
 
-STEPS_PER_MODE = 40  # of a crossing: twice those with which a search for step sizes begins
+STEPS_PER_MODE = 40  # of a crossing: twice the initial number in the search for step sizes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,10 @@ class Batches:
 
 
 def addresses_within_batches(case: Case, addresses: Collection[str]) -> list[str]:
-    """Those of some addresses on which no path depends: masses, forces and springs of loads."""
+    """Addresses that may differ within a batch, as no path depends on them.
+
+    These are masses, forces and springs of loads, gravity and profile numbers.
+    """
     return [
         address
         for address in addresses
@@ -73,9 +77,9 @@ def make_batches(
     within: Collection[str],
     most: int = MAX_BATCH_SIZE,
 ) -> Batches:
-    """Batches of runs, which are given by their values at the addresses (SI units).
+    """Batches of runs, given by their values (SI units) at the addresses.
 
-    Runs that differ in the values at the addresses `within` batches only share one, of `most` runs.
+    Runs that differ only at the addresses `within` are in the same batch, of `most` runs.
     """
     is_batched = np.array([address in within for address in addresses], bool)
     shared_values, batched_values = runs[:, ~is_batched], runs[:, is_batched]
@@ -103,7 +107,7 @@ def make_batches(
 
 
 def with_few_runs(batches: Batches, most: int) -> Batches:
-    """The batches with evenly spaced runs of theirs, the first and the last among them."""
+    """Batches reduced to at most `most` of their runs, evenly spaced from the first to the last."""
     runs = batches.run_index.shape[1]
     chosen = np.unique(np.linspace(0, runs - 1, min(most, runs)).round().astype(int))
     values, index = batches.batched_values[:, chosen], batches.run_index[:, chosen]
@@ -111,14 +115,14 @@ def with_few_runs(batches: Batches, most: int) -> Batches:
 
 
 def values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
-    """Number at an address in each batch."""
+    """Value at an address of the case in each batch."""
     if address in batches.shared_addresses:
         return batches.shared_values[:, batches.shared_addresses.index(address)]
     return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
 
 
 def swept_masses(case: Case, batches: Batches) -> Float[np.ndarray, " path"]:
-    """Sum of the swept masses of loads (kg) in each batch, of its run with the largest."""
+    """Largest sum of the swept masses of loads (kg) among the runs of each batch."""
     total = np.zeros(batches.run_index.shape)
     parts = (
         (batches.shared_addresses, batches.shared_values[:, None]),
@@ -132,7 +136,7 @@ def swept_masses(case: Case, batches: Batches) -> Float[np.ndarray, " path"]:
 
 
 def common_layout(case: Case, batches: Batches) -> Layout:
-    """Layout of all batches: the common order of positions, with the largest degrees of any.
+    """Layout for all batches: common order of positions, and the largest degree of each element.
 
     Raises ValueError if positions along the beam change their order within the sweep.
     """
@@ -163,9 +167,9 @@ def _largest(layouts: list[Layout], name: str) -> tuple[int, ...]:
 class RunSizes(NamedTuple):
     """Sizes of the runs of a sweep that decide how much memory they take.
 
-    A wheel passes `places` on the beam where steps end, besides those of corrected sensors. With
-    histories there are `samples`, and so many `steps` in a run; so many `given_steps` where a
-    profile or forces over time are given at the nodes of each, forces of each run, or profiles.
+    `places` on the beam end steps when a wheel passes, in addition to corrected sensors. Histories
+    have `samples` and `steps` per run. A profile or forces over time are stored at the nodes of
+    `given_steps`: forces (`has_forces`) and own profiles (`has_profiles`) for each run.
     """
 
     modes: int
@@ -180,10 +184,10 @@ class RunSizes(NamedTuple):
     has_profiles: bool
 
     def batch_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
-        """Memory (bytes) of a batch of so many runs with some sensors, at most.
+        """Upper bound of the memory (bytes) of a batch, for a number of runs and some sensors.
 
-        Counted are the matrices of all step lengths (those of C in `native/workspace.h`, those of
-        JAX in `DiscreteModel`), of a chunk of steps, and the results.
+        It counts the matrices of all step lengths (for C in `native/workspace.h`, for JAX in
+        `DiscreteModel`), of a chunk of steps, and the results.
         """
         panels, outputs = self.panels(sensors), len(sensors)
         side, modes_of_side = (self.states, self.modes) if self.coupled else (2, 1)
@@ -196,14 +200,14 @@ class RunSizes(NamedTuple):
         return 8.0 * (panels * of_length + 2 * CHUNK_STEPS * of_step + runs * of_run)
 
     def input_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
-        """Memory (bytes) of the time grid and the loads of a batch, and to make them."""
+        """Memory (bytes) to compute and hold the time grid and the loads of a batch."""
         of_node = 3 * (runs if self.has_profiles else 1) + runs * self.has_forces
         given = self.given_steps * self.wheels * native_peaks.PATH_NODES * of_node
         panels = 4 * self.panels(sensors) * (self.wheels + 8)
         return 8.0 * (panels + 20 * self.wheels * runs + 2 * given)
 
     def panels(self, sensors: Sequence[Sensor]) -> int:
-        """Number of panels of the time grid, at most."""
+        """Upper bound of the number of panels of the time grid."""
         corrected = sum(sensor.bends for sensor in sensors)
         return 1 + self.samples + self.wheels * (2 + self.places + corrected)
 
@@ -211,9 +215,9 @@ class RunSizes(NamedTuple):
 def run_sizes(
     case: Case, speeds: Float[np.ndarray, " speed"], histories: bool, profiles: bool
 ) -> RunSizes:
-    """Sizes of the runs of a case, of which the loads have `speeds` (m/s) up to the largest.
+    """Sizes of the runs of a case whose loads have `speeds` (m/s); NaN for loads that stand.
 
-    They may have `profiles` of their own. Those of loads that stand are NaN, and cross nothing.
+    With `profiles` each run has its own profile.
     """
     case = concrete_case(case)
     loads, layout, modes = load_set(case), mesh_layout(case), case.beam.modes
@@ -224,7 +228,7 @@ def run_sizes(
     if histories:
         samples = len(sample_times(case))
         steps = 2 * samples + of_crossings
-    given_steps = max(of_crossings, steps) if native_peaks.has_courses(case) else 0
+    given_steps = max(of_crossings, steps) if native_peaks.has_inputs_over_time(case) else 0
     states = 2 * modes + 4 * len(case.actuators)
     places = len(layout.degrees) + pieces
     return RunSizes(
@@ -242,7 +246,7 @@ def run_sizes(
 
 
 def largest_group(count: int, fits) -> int:
-    """Largest number, up to a count and at least 1, that `fits` a limit which falls with it."""
+    """Number of items that `fits` accepts: the count, halved until it fits; at least 1."""
     while count > 1 and not fits(count):
         count = -(-count // 2)
     return count

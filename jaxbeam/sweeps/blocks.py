@@ -1,4 +1,4 @@
-"""Runner of a sweep: its batches in blocks of equal shape, with the longest steps allowed.
+"""Runner of a sweep: computes its batches in blocks of equal shape, with the longest valid steps.
 
 Sensors that are too many for one integration are integrated in groups, one after the other.
 """
@@ -38,9 +38,9 @@ from jaxbeam.sweeps.integration import (
     Program,
     in_sequence,
 )
-from jaxbeam.sweeps.native_integration import NativeBatches, known_model
+from jaxbeam.sweeps.native_integration import NativeBatches, shared_model
 from jaxbeam.sweeps.step_size import (
-    RANDOM_SHARE,
+    RANDOM_FRACTION,
     PathTimes,
     Trials,
     choose_step_sizes,
@@ -53,17 +53,17 @@ from jaxbeam.sweeps.step_size import (
 
 LOGGER = logging.getLogger(__name__)
 MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and one write
-# The same where batches are integrated at once: an H100 takes 65536 runs in 0.33 s, in blocks of
-# all of them in 0.71 s. Histories are large, and have the blocks of a CPU.
+# Runs of a block whose batches are integrated at once: an H100 takes 65536 runs in 0.33 s, in one
+# block of all of them in 0.71 s. Histories are large, and have the blocks of a CPU.
 MAX_VECTORISED_RUNS = 16384
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
-# Batches, and runs of paths of their own, up to which the errors of all are measured: their results
-# are then known, too. Of few batches a sample is most of them.
+# Batches, and batches of one run, up to which the errors of all are measured: their results are
+# then computed, too. A sample of few batches is most of them.
 MAX_MEASURED_BATCHES, MAX_MEASURED_RUNS = 16, 256
 MAX_SEARCHED_RUNS = 8  # of a batch, with which the search for its step begins
-MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
+MAX_TRIAL_BATCHES = 16  # further batches of one run cost more than the steps that they would save
 # Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
 # some hundredths of a second, programs some seconds.
 MAX_PATHS, MAX_RUNS = 8, 1024
@@ -74,10 +74,10 @@ class Runner:
     """Runner of all batches of a sweep in blocks of equal shape.
 
     With `single` precision the integration is in float32, models and propagators are made in
-    float64; `native` steps are taken in C. Memory allows blocks of `most_batches`, and inputs of C
-    for `most_inputs` batches at once. Only C takes `profiles` of runs. If `small`, NumPy takes the
-    steps of a few batches, and nothing is compiled. Raises ValueError if positions along the beam
-    change their order within the sweep.
+    float64; `native` steps are taken in C. Memory allows blocks of `most_batches`, and inputs of
+    the C integrator for `most_inputs` batches at once. Only C takes `profiles` of runs. If `small`,
+    NumPy takes the steps of a few batches, and nothing is compiled. Raises ValueError if positions
+    along the beam change their order within the sweep.
     """
 
     def __init__(
@@ -104,13 +104,13 @@ class Runner:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         self.trials = Trials()
         self._set_block_size(most_batches)
-        # Loads, profiles, settings of the run and controllers do not change the model, which all
-        # batches then share; not on several devices, each of which has the models of its part.
+        # Loads, profiles, settings of the run and controllers do not change the model, so that all
+        # batches share one; not on several devices, each of which has the models of its part.
         leaves_model_unchanged = ("loads.", "profile.", "run.", "controller.")
         same_model = all(
             name.startswith(leaves_model_unchanged) for name in batches.shared_addresses
         )
-        self.known_model = known_model(case) if same_model and self.devices == 1 else None
+        self.shared_model = shared_model(case) if same_model and self.devices == 1 else None
         self.program = self._make_program(native)
         in_c = self._native_batches(most_inputs) if native else None
         # More threads than cores where some wait for others.
@@ -127,60 +127,60 @@ class Runner:
         self.limits = step_limits(case, batches, *limits)
 
     def _make_program(self, native: bool) -> Program:
-        """Data of the programs that compute peaks."""
+        """`Program` of the peaks of the sweep."""
         case, batches = self.case, self.batches
         shapes = StaticShapes(common_layout(case, batches), has_coupling(case), 1, native)
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
             max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
-        shared = self.known_model is not None and case.controller is None
+        shared = self.shared_model is not None and case.controller is None
         return Program(
             case,
             dataclasses.replace(shapes, max_loads=max_loads),
             batches.shared_addresses,
             batches.batched_addresses,
             self.schedule if case.controller is not None else None,
-            known_outputs=self.known_model.outputs if shared else None,
+            shared_outputs=self.shared_model.outputs if shared else None,
             devices=self.devices,
             profiles=self.profiles,
         )
 
     def _compile(self) -> CompiledBatches:
-        """Batches with compiled programs; times of their paths are computed meanwhile."""
-        known, events = self.known_model, None
-        if known is not None and self.schedule is None:
+        """Batches with compiled programs; path times are computed during the compilation."""
+        shared, events = self.shared_model, None
+        if shared is not None and self.schedule is None:
             events = self._path_times.load_events
-        settings = self.batches, self.batches_per_block, known and known.model, events
+        settings = self.batches, self.batches_per_block, shared and shared.model, events
         compiled = CompiledBatches(self.program, *settings, self.schedule)
         compilations = compiled.begin_compilation(self.pool)
-        _ = self._path_times  # meanwhile, unless they are known
+        _ = self._path_times  # computed meanwhile
         for compilation in compilations:
             compilation.result()  # raises its error, if any
         return compiled
 
     def _numpy_batches(self) -> NumpyBatches:
-        """Batches of a small sweep, without a program."""
-        known, events = self.known_model, None
-        if known is not None and self.schedule is None:
+        """Batches of a small sweep, integrated by NumPy without compilation."""
+        shared, events = self.shared_model, None
+        if shared is not None and self.schedule is None:
             events = self._path_times.load_events
-        model = known and known.model
+        model = shared and shared.model
         return NumpyBatches(self.program, self.batches, model, events, self.schedule)
 
     def _stable_steps(self) -> Float[np.ndarray, " path"]:
-        """Longest stable steps (s), infinite where there is none: a run fails with any step."""
-        if self.known_model is None:
+        """Longest stable steps (s) of the batches; infinite where no step is stable."""
+        if self.shared_model is None:
             limits = self.backend.make_models()
         else:
             loads = load_set(concrete_case(self.case), self.program.shapes.layout)
-            limit = max_stable_step(self.known_model.model, loads)
+            limit = max_stable_step(self.shared_model.model, loads)
             limits = np.repeat(limit, self.batches.run_index.shape[0])
         return np.where(np.isfinite(limits), limits, np.inf)
 
     def _set_block_size(self, most_batches: int):
-        """Numbers of batches per block and per trial, multiples of the number of devices.
+        """Set the numbers of batches per block and per trial, multiples of the number of devices.
 
-        On a device no more than `most_batches`.
+        A device has `most_batches` at most.
         """
         count, batch_size = self.batches.run_index.shape
         self.devices = len(jax.local_devices())
@@ -198,33 +198,36 @@ class Runner:
 
     @functools.cached_property
     def _path_times(self) -> PathTimes:
-        """Times of all paths, with passages of the model if all share one."""
+        """Load events and longest force steps of all paths.
+
+        Events include wheels that pass the event places of a shared model.
+        """
         case, places = concrete_case(self.case), np.zeros(0)
-        if self.known_model is not None:
-            places = self.known_model.event_places
+        if self.shared_model is not None:
+            places = self.shared_model.event_places
         found = path_times(case, self.batches.shared_addresses, self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
     def _native_batches(self, most_inputs: int) -> NativeBatches | None:
-        """Batches in C with inputs made by NumPy, if all share a model; else None.
+        """Batches integrated in C, their inputs made by NumPy; None unless all share a model.
 
-        Programs then make the inputs of C, unless they lack some.
+        Without a shared model, compiled programs make the inputs of C, where they can.
         """
-        if self.known_model is not None:
+        if self.shared_model is not None:
             program = self.program._replace(case=concrete_case(self.case))
-            given = self.known_model, self._path_times.load_events, self.batches
+            given = self.shared_model, self._path_times.load_events, self.batches
             with contextlib.suppress(NotVectorisedError):
                 sizes = self.batches_per_block, most_inputs
                 schedule = self.schedule if self.histories else None
                 return NativeBatches(program, *given, *sizes, schedule)
-        if native_peaks.has_courses(self.case) or self.case.controller is not None:
+        if native_peaks.has_inputs_over_time(self.case) or self.case.controller is not None:
             self.program = self._make_program(native=False)
         return None
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " steps"], float]:
-        """Step sizes (s) of all batches, then extra steps, and the estimated error of their peaks.
+        """Step sizes (s) of all batches, then their extra steps; and the relative error of peaks.
 
-        The error is relative. Raises RuntimeError if no time step meets the tolerance.
+        Raises RuntimeError if no time step meets the tolerance.
         """
         count = MIN_TRIAL_BATCHES
         if isinstance(self.backend, CompiledBatches):  # calls of a program take equally many
@@ -237,11 +240,11 @@ class Runner:
             with_few = self.backend.with_few_runs(MAX_SEARCHED_RUNS)
             few = with_few and functools.partial(self._trial_peaks, with_few, Trials())
         is_random = isinstance(self.case.profile, AbstractSpectralProfile)
-        share = RANDOM_SHARE if is_random else 1.0
+        fraction = RANDOM_FRACTION if is_random else 1.0
         rates, initial_steps, max_steps = self.limits
         search = rates, masses, initial_steps, max_steps, count
         steps, extra, error = choose_step_sizes(
-            of_all, *search, self.tolerance, all_measured, few, share
+            of_all, *search, self.tolerance, all_measured, few, fraction
         )
         if self.single:
             sample = stratified_sample(rates, count)
@@ -250,13 +253,13 @@ class Runner:
         return np.append(steps, extra), error
 
     def _trial_peaks(self, backend, trials, batch_indices, steps, extra_steps, single=False):
-        """Peaks (path, batch and quantity, sensor) of batches; their results become `trials`."""
+        """Peaks (path, batch and quantity, sensor) of batches; `trials` keep their results."""
         given = batch_indices, steps, extra_steps
         if single:
             results = self._trial_results(backend, *given, single)
             return self._compared_by_quantity(results["peak_deflection"])
         _, which = np.unique(np.stack(given), axis=1, return_index=True)
-        new = which[~trials.known(*(part[which] for part in given))]
+        new = which[~trials.has_results(*(part[which] for part in given))]
         if new.size:
             indices, own, extra = (part[new] for part in given)
             found = self._trial_results(backend, indices, own, extra, single)
@@ -265,7 +268,10 @@ class Runner:
         return self._compared_by_quantity(results["peak_deflection"])
 
     def _compared_by_quantity(self, peaks):
-        """Peaks (path, batch, sensor) of each quantity as further runs: they are not compared."""
+        """Peaks (path, batch and quantity, sensor): sensors of other quantities are zero.
+
+        So relative errors do not compare peaks of different quantities.
+        """
         quantities = np.array([sensor.quantity for sensor in self.case.sensors])
         return np.concatenate(
             [peaks * (quantities == one) for one in np.unique(quantities)], axis=1
@@ -279,12 +285,12 @@ class Runner:
     def block_function(
         self, steps: Float[np.ndarray, " steps"], trials: Trials | None = None
     ) -> Callable[[int], dict[str, np.ndarray]]:
-        """Function of a block's number: its results (path, batch, ...) by name.
+        """Function from the number of a block to its results (path, batch, ...) by name.
 
         `steps` are those of `choose_step_sizes`. Results among the `trials` are not
         computed again.
         """
-        substeps, known_results = None, trials or Trials()
+        substeps, stored_results = None, trials or Trials()
         steps, extra = np.split(steps, 2)
         extra = extra.astype(int)
         if self.histories:
@@ -292,16 +298,16 @@ class Runner:
         stepping = steps, extra, substeps
         integrate = self.backend.block_integrator(self._batches_of, *stepping, self.single)
         if self.histories or self.single:
-            known_results = Trials()  # trials are of peaks, in double precision
+            stored_results = Trials()  # trials are of peaks, in double precision
 
         def compute(block: int) -> dict[str, np.ndarray]:
             rows = self._batches_of(block)
             given = rows, steps[rows], extra[rows]
-            known = known_results.known(*given)
-            results = {} if known.all() else integrate(block, ~known)
-            if not known.any():
+            is_stored = stored_results.has_results(*given)
+            results = {} if is_stored.all() else integrate(block, ~is_stored)
+            if not is_stored.any():
                 return results
-            return known_results.completed(results, *given, known)
+            return stored_results.completed(results, *given, is_stored)
 
         return compute
 
@@ -311,18 +317,18 @@ class Runner:
         return np.arange(first, first + self.batches_per_block) % count
 
     def _trial_results(self, backend, batch_indices, steps, extra_steps, single):
-        """Results of batches by name, on all cores."""
+        """Results of batches by name, computed on all cores."""
         count = batch_indices.size
         results = []
         for rows in np.array_split(np.arange(count), -(-count // backend.most_at_once)):
             given = batch_indices[rows], steps[rows], extra_steps[rows], single
-            integrate, calls = backend.of_parts(*given, self.trial_batches)
+            integrate, calls = backend.rows_integrator(*given, self.trial_batches)
             results += self.pool.map(integrate, np.array_split(np.arange(rows.size), calls))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
 
 
 def suits_numpy(case: Case, batches: Batches, schedule) -> bool:
-    """Whether a sweep is small enough for NumPy, and its controller runs there."""
+    """Whether NumPy integrates a sweep: it is small, and needs no compiled control loop."""
     paths, runs = batches.run_index.shape
     if not in_sequence() or len(jax.local_devices()) > 1:
         return False
@@ -337,9 +343,9 @@ def _round_up(count: int, unit: int) -> int:
 
 
 class SensorGroups:
-    """Runners of the same batches with other sensors each, as one (see `blocks.Runner`).
+    """Runner of several groups of sensors: one `Runner` of the same batches for each group.
 
-    `groups` are the numbers of the sensors of each.
+    `groups` are the numbers of the sensors of each runner.
     """
 
     trials = None  # are not kept
@@ -351,11 +357,11 @@ class SensorGroups:
 
     @property
     def pool(self) -> ThreadPoolExecutor:
-        """Threads that compute blocks."""
+        """Pool of threads that compute blocks."""
         return self.runners[0].pool
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " steps"], float]:
-        """Steps of all batches that suit all sensors, as of a runner, and the error of peaks."""
+        """Steps of all batches, the finest of any group, and the largest error of peaks."""
         found = [runner.choose_step_sizes() for runner in self.runners]
         steps, errors = zip(*found, strict=True)
         sizes, extra = np.split(np.array(steps), 2, axis=1)
@@ -364,7 +370,7 @@ class SensorGroups:
     def block_function(
         self, steps: Float[np.ndarray, " steps"], trials: None = None
     ) -> Callable[[int], dict[str, np.ndarray]]:
-        """Function of a block's number: its results (path, batch, ...) by name."""
+        """Function from the number of a block to its results (path, batch, ...) by name."""
         functions = [runner.block_function(steps) for runner in self.runners]
         order = np.argsort(np.concatenate(self.groups))
 

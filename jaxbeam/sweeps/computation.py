@@ -45,7 +45,7 @@ def compute_sweep(
 
     Blocks are written to the store at a path, unless it is None.
 
-    `state` of the store is "new" or "resume" (see `Writing`); then the blocks in it are not
+    `state` of the store is "new" or "resume" (see `Writing`); blocks of a resumed store are not
     computed again, and count in the progress bar as done before. With a `client` of Dask its
     workers compute all blocks but the first.
     """
@@ -68,14 +68,14 @@ def compute_sweep(
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
     if estimates:
         worst = worst_runs(specification, dataset)
-        for quantity, share in estimated_errors(specification.case, worst).items():
-            dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
+        for quantity, truncation in estimated_errors(specification.case, worst).items():
+            dataset[f"peak_{quantity}"].attrs["truncation_error"] = truncation
     block_store.finish(dataset)
     return dataset
 
 
 def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
-    """Dataset of a sweep that is not stored, without estimated truncation errors."""
+    """Dataset of a sweep computed in memory, without a store or estimated truncation errors."""
     with ProgressBar(specification.count, "run", shown=False) as progress_bar:
         return compute_sweep(specification, None, "new", None, progress_bar, estimates=False)
 
@@ -83,7 +83,7 @@ def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
 def _begun(
     specification: SweepSpecification, path: Path | None, state: str, progress_bar: ProgressBar
 ) -> "tuple[AnyRunner, Float[np.ndarray, ' path'], float, BlockStore]":
-    """Runner, step sizes (s), estimated error and store of a sweep, new or to be continued."""
+    """Runner, step sizes (s), estimated error and store of a sweep, new or resumed."""
     if path is not None and state == "resume":
         stored = sweep_store.ZarrStore(path)
         runner = specification.resumed_runner(stored.specification())
@@ -105,8 +105,8 @@ def _begun(
 def _new_runner(specification: SweepSpecification) -> tuple[AnyRunner, bool]:
     """Runner of a new sweep, and whether it takes its steps in C.
 
-    The C integrator is compiled while programs are traced, which saves a third of a second. Where
-    that fails the sweep does without.
+    The C integrator is compiled while programs are traced, which saves a third of a second. The
+    steps are taken without it if that fails.
     """
     if specification.uses_c():
         with rare_collections(), native_peaks.LIBRARY.built_meanwhile():
@@ -117,8 +117,9 @@ def _new_runner(specification: SweepSpecification) -> tuple[AnyRunner, bool]:
 
 
 def _compute(runner: AnyRunner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
-    """Numbers of blocks as they are computed, on all cores, and stored."""
-    # A stored sweep that continues has no trials, and must agree to the bit.
+    """Yield the number of each block when it is stored; blocks are computed on all cores."""
+    # A resumed sweep has no trial results. A new stored sweep does not use its own either, so that
+    # both are bit-identical.
     trials = runner.trials if isinstance(block_store, MemoryStore) else None
     compute = runner.block_function(steps, trials)
     waiting, left = collections.deque(), iter(blocks)
@@ -140,7 +141,7 @@ def _compute(runner: AnyRunner, blocks: list[int], steps, block_store: BlockStor
 def _to_dataset(
     specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
 ) -> "xarray.Dataset":
-    """Results of all batches as a dataset with a dimension per address, or `run`."""
+    """Dataset of the results of all batches, with a dimension for each address, or `run`."""
     case, dims, shape = specification.case, specification.dims, specification.shape
     index = batches.run_index.reshape(-1)
     rows = np.empty(specification.count, int)
@@ -190,7 +191,7 @@ def _to_dataset(
 
 
 def worst_runs(specification: SweepSpecification, dataset) -> dict[str, WorstRun]:
-    """Run with the largest peak of each quantity; none where all runs failed."""
+    """Run with the largest peak of each quantity; quantities whose runs all failed are left out."""
     runs, worst = specification.runs(), {}
     quantities = [sensor.quantity for sensor in specification.case.sensors]
     peaks = {q: dataset[f"peak_{q}"].values.reshape(len(runs), -1) for q in set(quantities)}
@@ -204,7 +205,7 @@ def worst_runs(specification: SweepSpecification, dataset) -> dict[str, WorstRun
 
 
 def _peak_variables(case: Case, dims: tuple[str, ...], peaks) -> dict[str, tuple]:
-    """Peaks (..., sensor) as a variable for each quantity, NaN at sensors of others."""
+    """Dataset variable of the peaks (..., sensor) of each quantity, NaN at other sensors."""
     quantities = np.array([sensor.quantity for sensor in case.sensors])
     variables = {}
     corrected = any(sensor.bends for sensor in case.sensors) and is_corrected(case)

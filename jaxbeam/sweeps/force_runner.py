@@ -192,8 +192,9 @@ def force_runner(
 
     A block of runs takes at most `block_bytes` of memory, if one run takes no more.
     """
-    known = all(map(ADDRESS.fullmatch, batches.shared_addresses)) and not batches.batched_addresses
-    if not (known and case.controller is None and tolerance >= LEAST_TOLERANCE):
+    one_model = not batches.batched_addresses
+    one_model = one_model and all(map(ADDRESS.fullmatch, batches.shared_addresses))
+    if not (one_model and case.controller is None and tolerance >= LEAST_TOLERANCE):
         return None
     case = concrete_case(case)
     loads = load_set(case)
@@ -209,9 +210,9 @@ def force_runner(
 
 @functools.lru_cache(maxsize=4)
 def _systems(content: str) -> list[ForceSystem] | None:
-    """Systems of the beam and groups of sensors of a case, from those of its file as JSON.
+    """Force system of the beam for each group of sensors; None where there is no closed form.
 
-    And the eccentricity (m) of the forces.
+    `content` is JSON of the keys OF_BEAM of a case, and of the eccentricity (m) of the forces.
     """
     of_case, arm = json.loads(content)
     case = case_from_dict(of_case)
@@ -232,7 +233,7 @@ def _systems(content: str) -> list[ForceSystem] | None:
 
 @remembered_within(RESPONSE_BYTES)
 def _responses(system: str, group: int, speeds: tuple[float, ...]) -> ForceResponses:
-    """Responses of a group of outputs to forces of some speeds (m/s), which trains share."""
+    """Responses of a group of outputs to forces at some speeds (m/s), the same for all trains."""
     found = _systems(system)
     assert found is not None
     return force_responses(found[group], np.array(speeds))

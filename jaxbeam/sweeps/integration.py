@@ -57,12 +57,12 @@ from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, with_few_runs
 from jaxbeam.sweeps.step_size import PathEvents
 
-# Rows of what the sensors measure, and their static correction.
+# Output rows of the sensors on the modal states, and their static correction.
 Outputs = tuple[OutputRows, StaticCorrection | None]
 
 
 class Stepping(NamedTuple):
-    """Steps of a batch: the longest (s), extra steps per panel, and load events, if known."""
+    """Steps of a batch: the longest (s), extra steps per panel, and load events, if computed."""
 
     max_step: Array
     extra_steps: Array
@@ -72,10 +72,10 @@ class Stepping(NamedTuple):
 class Program(NamedTuple):
     """Data of the programs of a sweep: case, static shapes, addresses of the values.
 
-    With a `schedule` steps end at its events; with `substeps` there are so many between events, and
-    histories are saved, otherwise the step size of each batch determines their number.
-    `known_outputs` are those of all batches, if they share them. Each of the `devices` computes a
-    part of a block. Batches may differ in which of the `profiles` each run has.
+    With a `schedule` steps end at its events; with `substeps` each interval between events has
+    this number of steps, and histories are saved, otherwise the step size of each batch determines
+    the number. `shared_outputs` are those of all batches, if they share a model. Each of the
+    `devices` computes a part of a block. Runs may differ in their number among the `profiles`.
     """
 
     case: Case
@@ -84,23 +84,23 @@ class Program(NamedTuple):
     batched_addresses: tuple[str, ...]
     schedule: EventSchedule | None = None
     substeps: int | None = None
-    known_outputs: Outputs | None = None
+    shared_outputs: Outputs | None = None
     devices: int = 1
     profiles: tuple[AbstractProfile, ...] = ()
 
     def case_with(self, shared_values) -> Case:
-        """Case of a batch."""
+        """Case with the shared values of a batch."""
         return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
     def loads(self, shared_values, batched_values) -> LoadSet:
-        """Loads of a batch, in all its runs."""
+        """Loads of a batch, with a last axis for its runs."""
         varied = self.case_with(shared_values)
 
         def wheels_of_run(values):
             pairs = dict(zip(self.batched_addresses, values, strict=True))
             pairs.pop(PROFILE_NUMBER, None)  # changes no wheel
             wheels = wheel_set(replace(varied, pairs))
-            if wheels.massless:  # known to be, which `vmap` would hide: no equations of contact
+            if wheels.massless:  # no contact equations; `vmap` would hide that the inertia is zero
                 wheels = eqx.tree_at(_inertia, wheels, None)
             return jax.tree.map(lambda part: part[..., 0], wheels)
 
@@ -113,9 +113,9 @@ class Program(NamedTuple):
     def grid(self, model, shared_values, stepping: Stepping):
         """Time grid of a batch."""
         varied, steps = self.case_with(shared_values), (stepping.max_step, stepping.extra_steps)
-        known = stepping.load_events
-        if known is not None:
-            return grid_by_step_length(varied, model, *steps, known_events=known)
+        events = stepping.load_events
+        if events is not None:
+            return grid_by_step_length(varied, model, *steps, given_events=events)
         places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
             return grid_by_step_length(varied, model, *steps, places)
@@ -124,19 +124,19 @@ class Program(NamedTuple):
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
     def discretise(self, model, shared_values, stepping, policy=None):
-        """Discrete model of a batch, with peaks of what the sensors measure."""
+        """Discrete model of a batch, with the outputs of its sensors."""
         grid = self.grid(model, shared_values, stepping)
         return discrete_model(model, grid, None, policy, *self.outputs(model, shared_values))
 
     def outputs(self, model, shared_values) -> Outputs:
-        """Outputs of a batch."""
-        if self.known_outputs is not None:
-            return self.known_outputs
+        """Output rows and static correction of the sensors of a batch."""
+        if self.shared_outputs is not None:
+            return self.shared_outputs
         return outputs_of(self.case_with(shared_values), model)
 
 
 def outputs_of(case: Case, model: ModalModel) -> Outputs:
-    """Rows of what the sensors of a case measure, and their static correction."""
+    """Output rows of the sensors of a case on the modal states, and their static correction."""
     rows = sensor_rows(model, case, case.sensors)
     return rows, static_correction(model, case, case.sensors, rows)
 
@@ -156,7 +156,7 @@ def modal_models(program: Program, shared_values):
 
 @compiled(**PARALLEL_COMPILATION)
 def discrete_models(program: Program, mask, models, shared_values, stepping):
-    """Discrete models of batches; a single model is shared by all and stays single."""
+    """Discrete models of batches; a modal model that all batches share is not repeated."""
     shared_model, own_models = _split_shared_model(models)
 
     def discretise_one(own_model, shared, step):
@@ -173,14 +173,14 @@ def discrete_models(program: Program, mask, models, shared_values, stepping):
 
 
 def block_program(program: Program, single: bool) -> Compiled:
-    """The program of a block: `native_block`, whose steps are taken in C, or `integrate_block`."""
+    """Compiled program of a block: `native_block` for steps in C, or `integrate_block`."""
     native = program.shapes.native and program.substeps is None and not single
     return native_block if native else integrate_block
 
 
 @compiled
 def integrate_block(program: Program, mask, models, shared_values, batched_values, stepping):
-    """Results of a block by name: runs of a batch vectorised, batches in sequence on each device.
+    """Results of a block by name; runs of a batch are vectorised, batches follow in sequence.
 
     `models` are discrete models, or modal models, which are discretised here; None with a
     controller, whose closed loop has a model of its own.
@@ -195,7 +195,7 @@ def integrate_block(program: Program, mask, models, shared_values, batched_value
 def native_block(
     program: Program, mask, models, shared_values, batched_values, stepping
 ) -> native_peaks.NativeInputs:
-    """What the C integrator needs to know of a block, from modal models."""
+    """Inputs of the C integrator for a block, from modal models."""
     del mask
     shared_model, own_models = _split_shared_model(models)
 
@@ -210,7 +210,7 @@ def native_block(
 
 
 def _on_devices(integrate, devices: int):
-    """A function of arrays of batches, each device computing its part of them."""
+    """Function `integrate` split over the devices, each of which computes a part of the batches."""
     if devices == 1:
         return integrate
     mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
@@ -218,7 +218,7 @@ def _on_devices(integrate, devices: int):
 
 
 def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, stepping):
-    """Results of the integrator in JAX."""
+    """Results by name of the batches of a block, integrated in JAX."""
     if discrete is None:
         return _map_masked(
             lambda values: _closed_loop_results(program, *values),
@@ -239,7 +239,7 @@ def _compiled_results(program: Program, mask, discrete, shared_values, batched_v
 
 
 def _closed_loop_results(program: Program, shared_values, batched_values, stepping):
-    """Results of a batch with a controller."""
+    """Results by name of a batch with a controller."""
     varied, loads = program.case_with(shared_values), program.loads(shared_values, batched_values)
     policy = closed_loop(varied, program.shapes.layout, loads, program.schedule)
     return results(
@@ -281,7 +281,7 @@ def in_sequence() -> bool:
 
 
 def _map_masked(function, mask, values):
-    """Values of a function for each marked batch; any for the others."""
+    """Values of a function for each batch in the mask; undefined for the others."""
     if not in_sequence():
         return jax.vmap(function)(values)
     function = jax.jit(function)  # traced once
@@ -298,7 +298,7 @@ def _inertia(wheels):
 
 
 def _split_shared_model(models: ModalModel):
-    """Model that all batches share, or None, and the models of each, or None."""
+    """Modal model that all batches share, and models of each batch; one of the two is None."""
     if models.state_matrix.shape[0] > 1:
         return None, models
     return jax.tree.map(lambda leaf: leaf[0], models), None
@@ -313,30 +313,31 @@ def _with_model(discrete, model):
 
 
 class Batchwise:
-    """Batches that are integrated in calls of a few, or of a block of them (see `integrate`)."""
+    """Base of the integrators of batches, which take a few batches or a block in a call."""
 
-    most_at_once = sys.maxsize  # of which calls are made together
+    most_at_once = sys.maxsize  # batches whose inputs memory allows at once
 
     def with_few_runs(self, most: int) -> "Batchwise | None":
-        """The batches with at most so many of their runs; None where that saves nothing."""
+        """Integrator of the batches reduced to `most` runs; None where that saves nothing."""
         del most
         return None
 
-    def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
-        """Function of some rows of the batches: their results by name; and number of calls."""
+    def rows_integrator(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
+        """Function from rows of `batch_indices` to their results by name; and number of calls."""
 
         def integrate(rows):
             return self.integrate_few(batch_indices[rows], steps[rows], extra_steps[rows], single)
 
         count = batch_indices.size
-        return integrate, min(count, max(2, -(-count // per_call)))  # two at least, side by side
+        return integrate, min(count, max(2, -(-count // per_call)))  # two at least, in parallel
 
     def block_integrator(
         self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
     ):
-        """Function of a block's number and a mask of its batches: results of those in the mask.
+        """Function from the number of a block and a mask of its batches to results by name.
 
-        `batches_of` a block are its batches, `steps` (s) and `extra_steps` those of all.
+        `batches_of` gives the batches of a block; `steps` (s) and `extra_steps` are those of all
+        batches. Batches outside the mask have undefined results.
         """
 
         def integrate_block(block, mask):
@@ -349,9 +350,9 @@ class Batchwise:
 class CompiledBatches(Batchwise):
     """Batches whose runs compiled programs integrate.
 
-    `program` is the data of those of peaks; histories are at the events of the `schedule`. Batches
-    share the `model`, if it is given, and have the `load_events`, if these are known. Otherwise
-    their models are made by `make_models`.
+    `program` is for peaks; histories are at the events of the `schedule`. Batches share the
+    `model`, if it is given; otherwise `make_models` makes their models. `load_events` of all paths
+    are computed in the programs unless they are given.
     """
 
     def __init__(
@@ -374,14 +375,14 @@ class CompiledBatches(Batchwise):
         self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
 
     def begin_compilation(self, pool: Executor) -> list[Future]:
-        """Compile the programs of peaks in other threads."""
+        """Start the compilation of the programs of peaks in other threads."""
         return [
             pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile()
         ]
 
     def _programs_to_compile(self) -> Iterator[tuple[Compiled, tuple]]:
-        """Programs of peaks, the slowest to compile first, and template arguments."""
+        """Programs of peaks and template arguments of each, the slowest to compile first."""
         program, indices = self.program, np.zeros(self.block_size, int)
         stepping, mask = self._stepping(indices, np.ones(indices.size), indices), indices > 0
         shared_values, models = self.batches.shared_values[self._model_groups()[0]], self.models
@@ -409,7 +410,7 @@ class CompiledBatches(Batchwise):
         return list(np.resize(np.arange(count), (blocks, self.block_size)))
 
     def make_models(self) -> Float[np.ndarray, " path"]:
-        """Make the models of all batches; their longest stable steps (s)."""
+        """Make the models of all batches, and return their longest stable steps (s)."""
         groups = [
             modal_models(self.program, self.batches.shared_values[group])
             for group in self._model_groups()
@@ -425,7 +426,7 @@ class CompiledBatches(Batchwise):
         single: bool,
     ) -> dict[str, np.ndarray]:
         """Results (path, batch, ...) by name of at most a block of batches; see `integrate`."""
-        # They are spread over the block, so that each device has its part.
+        # Batches are spread over the block, so that each device has some.
         rows = np.arange(batch_indices.size) * self.block_size // batch_indices.size
         mask = np.zeros(self.block_size, bool)
         mask[rows] = True
@@ -443,10 +444,10 @@ class CompiledBatches(Batchwise):
         substeps: int | None,
         single: bool,
     ) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) by name of a block of batches; any for those not in the mask.
+        """Results (path, batch, ...) by name of a block of batches; undefined outside the mask.
 
-        With steps (s) at most, and extra steps in each panel; with `substeps` between samples also
-        histories. In `single` precision they are integrated in float32.
+        `steps` (s) are upper limits; `extra_steps` are added in each panel. With `substeps` between
+        samples results include histories. In `single` precision integration is in float32.
         """
         stepping = self._stepping(batch_indices, steps, extra_steps)
         program, models = self._program(substeps), self._models_of(batch_indices)
@@ -468,20 +469,20 @@ class CompiledBatches(Batchwise):
         return {name: np.asarray(values) for name, values in results.items()}
 
     def _program(self, substeps: int | None) -> Program:
-        """Data of the programs of peaks, or with `substeps` of histories."""
+        """`Program` of peaks, or with `substeps` of histories."""
         if substeps is None:
             return self.program
         return self.program._replace(schedule=self.schedule, substeps=substeps)
 
     def _stepping(self, batch_indices, steps, extra_steps) -> Stepping:
-        """Steps of batches, with their load events, if they are known."""
+        """Steps of batches, with their load events, if these are given."""
         events = jax.tree.map(lambda part: part[batch_indices], self.load_events)
         return Stepping(steps, extra_steps, events)
 
     def _models_of(self, batch_indices):
-        """Models of batches; one that all share is single. None with a controller.
+        """Models of batches, or the single model that all share; None with a controller.
 
-        Its closed loop has a model of its own.
+        The closed loop has a model of its own.
         """
         if self.controlled:
             return None
@@ -496,13 +497,13 @@ class CompiledBatches(Batchwise):
 
 @contextlib.contextmanager
 def _single_precision():
-    """A context of float32; of all its digits in products, of which GPUs keep three by default."""
+    """Context of float32 with products at full precision, of which GPUs keep three digits else."""
     with jax.enable_x64(False), jax.default_matmul_precision("highest"):
         yield
 
 
 def _to_single_precision(leaf):
-    """Array in float32 or int32; booleans and static values as they are."""
+    """Array in float32 or int32; booleans and static values unchanged."""
     if not eqx.is_array(leaf) or leaf.dtype == bool:
         return leaf
     return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)
@@ -522,10 +523,10 @@ class NumpyBatches(Batchwise):
         self.program = program._replace(case=concrete_case(program.case))
         self.batches, self.model, self.schedule = batches, model, schedule
         self.load_events = load_events
-        self._of_batch = functools.cache(self._case_and_loads)
+        self._cached_case_and_loads = functools.cache(self._case_and_loads)
 
     def with_few_runs(self, most):
-        """The batches with at most so many of their runs."""
+        """Integrator of the batches reduced to `most` of their runs."""
         few = with_few_runs(self.batches, most)
         return NumpyBatches(self.program, few, self.model, self.load_events, self.schedule)
 
@@ -533,7 +534,7 @@ class NumpyBatches(Batchwise):
         """Longest stable steps (s) of all batches."""
         limits = []
         for batch in range(self.batches.run_index.shape[0]):
-            case, loads = self._of_batch(batch)
+            case, loads = self._cached_case_and_loads(batch)
             limits.append(float(max_stable_step(self._model(case), loads)))
         return np.array(limits)
 
@@ -552,19 +553,19 @@ class NumpyBatches(Batchwise):
         single: bool,
     ) -> dict[str, np.ndarray]:
         """Results (path, batch, ...) by name of batches, zero for those not in the mask."""
-        del single  # suits no sweep here
+        del single  # NumPy takes no sweeps in single precision
         program = self.program
         if substeps is not None:
             program = program._replace(schedule=self.schedule, substeps=substeps)
-        results, known = {}, {}
+        results, computed_rows = {}, {}
         for row in np.flatnonzero(mask):
             batch = int(batch_indices[row])
             same = batch, steps[row], extra_steps[row]
-            if same in known:  # small samples name a batch more than once
+            if same in computed_rows:  # small samples name a batch more than once
                 for values in results.values():
-                    values[row] = values[known[same]]
+                    values[row] = values[computed_rows[same]]
                 continue
-            known[same], events = row, None
+            computed_rows[same], events = row, None
             if self.load_events is not None:
                 events = jax.tree.map(lambda part, batch=batch: part[batch], self.load_events)
             stepping = Stepping(steps[row], extra_steps[row], events)
@@ -578,7 +579,7 @@ class NumpyBatches(Batchwise):
 
     def _results(self, program: Program, batch: int, stepping) -> dict[str, np.ndarray]:
         shared = self.batches.shared_values[batch]
-        case, loads = self._of_batch(batch)
+        case, loads = self._cached_case_and_loads(batch)
         if case.controller is None:
             discrete = program.discretise(self._model(case), shared, stepping)
             return results(program, discrete, case, loads)
@@ -587,7 +588,7 @@ class NumpyBatches(Batchwise):
         return results(program, discrete, case, loads, policy)
 
     def _case_and_loads(self, batch: int) -> tuple[Case, LoadSet]:
-        """Case of a batch, and its loads in all runs."""
+        """Case of a batch, and its loads with a last axis for the runs."""
         shared = self.batches.shared_values[batch]
         values = self.batches.batched_values[batch]
         case = self.program.case_with(shared)

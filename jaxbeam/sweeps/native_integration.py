@@ -1,9 +1,9 @@
-"""Integration of the batches of a sweep in C: what C needs to know, and events of sampled loops.
+"""Integration of the batches of a sweep in C: inputs of the integrator, and sampled loops in C.
 
 The inputs of batches that share a model are made in NumPy, without a compiler. The events of a
 sampled loop are the functions of `sampled_loop`, traced and translated (`runtime/c_translation`),
-for eight runs at once. Numbers of the loop are arguments, so that loops of one structure share the
-compiled code.
+for eight runs at once. Numbers of the loop are arguments, so that loops of one structure use the
+same compiled code.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 class TranslatedLoop(NamedTuple):
     """C code of the events of a loop, its arguments, and its memory at the start of a run.
 
-    `failures` is the place in the memory of the number of samples without a solution.
+    `failures` is the index in the memory of the number of samples without a solution.
     """
 
     text: str
@@ -147,13 +147,13 @@ def _is_number(leaf: Any) -> bool:
 
 
 def _as_argument(array) -> np.ndarray:
-    """An array as C takes it: of float64 or int64."""
+    """Contiguous array of float64 or int64, as an argument of C."""
     kind = float if np.issubdtype(np.asarray(array).dtype, np.floating) else np.int64
     return np.ascontiguousarray(array, kind)
 
 
 def _text(jaxpr, arrays, leaves, state) -> str:
-    """File of C of the program of an event."""
+    """C file of the program of an event."""
     writer = Translation()
     given: list[CArray] = []
     number = itertools.count()
@@ -181,7 +181,7 @@ def _text(jaxpr, arrays, leaves, state) -> str:
 
 
 def _loaded(writer: Writer, stored: CArray, kind: str) -> CArray:
-    """A part of the memory, which the program may change while it reads it."""
+    """Copy of a part of the memory, which the program may change while it reads the copy."""
     texts = {"d": "{}", "i": "__builtin_convertvector({}, Mask)", "b": "{} != 0"}
     return writer.each(texts[kind], kind, stored.shape, [stored], True)
 
@@ -225,8 +225,8 @@ class NativeLoops:
         rows = history_rows(case, model) if histories else None
         return native_peaks.loop_model_inputs(model, *outputs_of(case, model), rows)
 
-    def of_designs(self, batch_indices: Int[np.ndarray, " path"]) -> dict[str, np.ndarray]:
-        """Those of the `NativeInputs` that the laws of batches determine."""
+    def law_inputs(self, batch_indices: Int[np.ndarray, " path"]) -> dict[str, np.ndarray]:
+        """Fields of `NativeInputs` that depend on the laws of batches."""
         design = np.zeros(len(batch_indices), int) if self.shared else batch_indices
         starts = np.stack([self.translations[i].memory for i in design])
         return {"memory": starts, "loop_numbers": self.addresses[design]}
@@ -238,7 +238,7 @@ class NativeLoops:
         mask: Bool[np.ndarray, " path"],
         inputs: native_peaks.NativeInputs,
     ) -> dict[str, np.ndarray]:
-        """Results by name; those of runs that diverge are NaN."""
+        """Results of batches by name; NaN for runs that diverge."""
         found = native_peaks.integrate_loops(max_loads, mask, inputs, self.loop)
         peaks, failures, amplitudes, history = found
         for row in np.flatnonzero(mask):
@@ -252,7 +252,7 @@ class NativeLoops:
         return Peaks(*peaks)._asdict() | {"controller_failures": failures, "deflection": history}
 
     def _least_amplitude(self, batch: int) -> Float[np.ndarray, " run"]:
-        """Amplitudes from which growth is divergence, of the runs of a batch."""
+        """Amplitudes of the runs of a batch above which growth counts as divergence."""
         if self.program.case.controller.open_loop:
             return np.full(self.batches.run_index.shape[1], np.inf)
         shared = self.batches.shared_values[batch]
@@ -271,7 +271,7 @@ class NativeLoops:
         return loop
 
     def _is_shared(self) -> bool:
-        """Whether all batches have one law: it depends on no number that differs between them."""
+        """Whether one law serves all batches: it depends on no number that differs between them."""
         controller = self.program.case.controller
         if controller.design_depends_on_loads or controller.design_depends_on_paths:
             return len(self.batches.shared_values) == 1
@@ -279,17 +279,17 @@ class NativeLoops:
 
 
 def history_rows(case: Case, model: ModalModel) -> Float[np.ndarray, "sensor state"]:
-    """Rows from the state of a model to the deflections (m) at the sensors of a case."""
+    """Output rows of the deflections (m) at the sensors of a case, on the state of a model."""
     rows = np.zeros((len(case.sensors), model.state_count))
     modes = slice(0, 2 * case.beam.modes, 2)
     rows[:, modes] = model.shapes(case.sensor_positions, (0,))[0]
     return rows
 
 
-class KnownModel(NamedTuple):
-    """What a structure determines: its modal model, and the outputs of its sensors.
+class SharedModel(NamedTuple):
+    """Modal model and sensor outputs of a structure, shared by all batches of a sweep of loads.
 
-    At the `event_places` (m) a passing wheel is a load event.
+    A wheel that passes one of the `event_places` (m) is a load event.
     """
 
     model: ModalModel
@@ -297,32 +297,32 @@ class KnownModel(NamedTuple):
     event_places: Float[np.ndarray, " place"]
 
 
-def known_model(case: Case) -> KnownModel:
-    """Model that all batches share whose loads and settings of the run alone differ."""
+def shared_model(case: Case) -> SharedModel:
+    """Model that batches share if they differ only in loads, profiles, control and run settings."""
     return _model_of(structure_of(concrete_case(case)))
 
 
 @remembered
-def _model_of(structure: Case) -> KnownModel:
+def _model_of(structure: Case) -> SharedModel:
     layout = mesh_layout(structure)
     model = modal_model(structure, layout, has_coupling(structure))
     places = event_places(model, corrected_places(structure, model, structure.sensors))
-    found = KnownModel(model, outputs_of(structure, model), places)
+    found = SharedModel(model, outputs_of(structure, model), places)
     return jax.tree.map(np.asarray, found)
 
 
 class NativeBatches:
-    """Batches of known numbers that share a model and outputs, integrated in C.
+    """Batches of concrete numbers that share a model and outputs, integrated in C.
 
-    `events` are those of all paths. Histories are at the samples of a `schedule`. Inputs are made
-    for at most `most_at_once` batches, unless a block has more. Raises NotVectorisedError where
-    loads cannot be vectorised.
+    `events` are the load events of all paths. Histories are at the samples of a `schedule`. Inputs
+    are made for at most `most_at_once` batches, unless a block has more. Raises NotVectorisedError
+    where loads cannot be vectorised.
     """
 
     def __init__(
         self,
         program: Program,
-        known: KnownModel,
+        known: SharedModel,
         events: PathEvents,
         batches: Batches,
         block_size: int,
@@ -331,7 +331,7 @@ class NativeBatches:
     ):
         self.program, self.batches, self.schedule = program, batches, schedule
         self.block_size, self.most_at_once = block_size, most_at_once
-        self.known, self.loops = known, None
+        self.shared_model, self.loops = known, None
         self._load_set = functools.cache(self._load_set_of)
         self.events = events, values_at(program.case, batches, "run.duration")
         with np.errstate(all="ignore"):  # as in compiled code
@@ -345,25 +345,27 @@ class NativeBatches:
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
         }
-        # Those of large sweeps are made for each call; a single batch tells whether they can be.
+        # Loads of large sweeps are computed in each call; here, those of one batch show whether
+        # they can be vectorised.
         count, runs = batches.run_index.shape
         few = count * runs <= GROUP_RUNS
         loads = _paths_and_wheels(program, batches, np.arange(count if few else 1))
         self.all_loads = loads if few else None
 
-    def of_batches(
+    def inputs_of_batches(
         self,
         batch_indices: Int[np.ndarray, " task"],
         max_steps: Float[np.ndarray, " task"],
         extra_steps: Int[np.ndarray, " task"],
         substeps: int | None = None,
     ) -> native_peaks.NativeInputs:
-        """Inputs of some batches, with steps (s) at most and extra steps in each panel.
+        """Inputs of the C integrator for some batches, from their steps (s) and extra steps.
 
-        With `substeps` between the events of the schedule, with histories.
+        `max_steps` (s) are upper limits, `extra_steps` are added in each panel. With `substeps`
+        between the events of the schedule, inputs are those of histories.
         """
 
-        def of_batch(events, duration, max_step, extra_steps, *loads):
+        def inputs_of_batch(events, duration, max_step, extra_steps, *loads):
             grid = grid_between_events(events, duration, max_step, extra_steps)
             return native_peaks.batch_inputs(grid, *loads)
 
@@ -371,20 +373,20 @@ class NativeBatches:
         with np.errstate(all="ignore"):
             loads = self._loads(batch_indices)
             if self.program.schedule is None and substeps is None:
-                found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
+                found = vectorised(inputs_of_batch)(*events, max_steps, extra_steps, *loads)
             else:
                 found = self._scheduled(
                     batch_indices, max_steps, extra_steps, events[0], loads, substeps
                 )
             if self.loops is not None:
-                found |= self.loops.of_designs(batch_indices)
+                found |= self.loops.law_inputs(batch_indices)
         found |= native_peaks.shared_vehicles(found)
-        if native_peaks.has_courses(self.program.case):
+        if native_peaks.has_inputs_over_time(self.program.case):
             found |= self._over_time(batch_indices, loads[1], found)
         return native_peaks.NativeInputs(**self.of_model, **found)
 
     def _over_time(self, batch_indices, wheels: WheelSet, found) -> dict[str, np.ndarray]:
-        """Inputs of batches that are functions of time, for the steps that have been found."""
+        """Fields of `NativeInputs` for profiles and forces over time, at the steps in `found`."""
         batches = []
         for row, batch in enumerate(batch_indices):
             own = jax.tree.map(lambda part, row=row: part[row], wheels)
@@ -401,35 +403,35 @@ class NativeBatches:
     def _scheduled(
         self, batch_indices, max_steps, extra_steps, events, loads, substeps: int | None
     ) -> dict[str, np.ndarray | None]:
-        """Those of the `NativeInputs` that differ between batches whose steps end at a schedule's.
+        """Fields of `NativeInputs` of batches whose steps end at the events of a schedule.
 
-        From the times of the load events, and from cubics and wheels of the loads.
+        `events` are the times of the load events (s), `loads` cubics and wheels of the loads.
         """
         rows, schedule = [], self.program.schedule if substeps is None else self.schedule
         assert schedule is not None
         for row, batch in enumerate(batch_indices):
             case = self.program.case_with(self.batches.shared_values[batch])
-            own, paths = (
+            batch_events, paths = (
                 jax.tree.map(lambda part, row=row: part[row], one) for one in (events, loads)
             )
             count = np.ceil(schedule.lengths.max() / max_steps[row]) + extra_steps[row]
-            model, parts = self.known.model, int(count) if substeps is None else substeps
-            grid = grid_by_schedule(case, model, schedule, parts, known_events=own)
-            of_batch = native_peaks.batch_inputs(grid, *paths)
-            of_batch |= {"lengths_of_panels": grid.length_index, "events": grid.event}
+            model, parts = self.shared_model.model, int(count) if substeps is None else substeps
+            grid = grid_by_schedule(case, model, schedule, parts, given_events=batch_events)
+            inputs = native_peaks.batch_inputs(grid, *paths)
+            inputs |= {"lengths_of_panels": grid.length_index, "events": grid.event}
             if substeps is not None:
                 samples = np.full(grid.boundaries.size, -1)
                 sampled = grid.event_panels[schedule.sample_events]
                 samples[sampled] = np.arange(sampled.size)
-                of_batch["samples"] = samples
-            rows.append(of_batch)
+                inputs["samples"] = samples
+            rows.append(inputs)
         return {
             name: None if part is None else np.stack([one[name] for one in rows])
             for name, part in rows[0].items()
         }
 
     def _load_set_of(self, batch: int) -> LoadSet:
-        """Loads of a batch, with the profiles of its runs."""
+        """Loads of a batch, with the profile of each of its runs."""
         case = self.program.case_with(self.batches.shared_values[batch])
         loads, profiles = load_set(case, self.program.shapes.layout), self.program.profiles
         if not profiles:
@@ -440,10 +442,10 @@ class NativeBatches:
         together = profiles_of_runs([profiles[int(number)] for number in numbers])
         return dataclasses.replace(loads, profile=together)
 
-    def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
-        """Function of some rows of the batches: their results by name; and number of calls."""
+    def rows_integrator(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
+        """Function from rows of `batch_indices` to their results by name; and number of calls."""
         del single, per_call
-        inputs = self.of_batches(batch_indices, steps, extra_steps)
+        inputs = self.inputs_of_batches(batch_indices, steps, extra_steps)
 
         def integrate(rows):
             everyone = np.ones(rows.size, bool)
@@ -452,21 +454,21 @@ class NativeBatches:
         return integrate, min(batch_indices.size, os.cpu_count() or 1)
 
     def with_few_runs(self, most: int) -> "NativeBatches | None":
-        """The batches with at most so many of their runs; None with a loop, which is made once."""
+        """Integrator of the batches reduced to `most` runs; None with a control loop."""
         if self.loops is not None:
             return None
         few, sizes = with_few_runs(self.batches, most), (self.block_size, self.most_at_once)
         return NativeBatches(
-            self.program, self.known, self.events[0], few, *sizes, schedule=self.schedule
+            self.program, self.shared_model, self.events[0], few, *sizes, schedule=self.schedule
         )
 
     def block_integrator(
         self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
     ):
-        """Function of a block's number and a mask of its batches: results of those in the mask.
+        """Function from the number of a block and a mask of its batches to results by name.
 
-        `batches_of` a block are its batches, `steps` (s) and `extra_steps` those of all. Inputs are
-        made for several blocks at once.
+        `batches_of` gives the batches of a block; `steps` (s) and `extra_steps` are those of all
+        batches. Inputs are made for several blocks at once.
         """
         del single
         count, runs = self.batches.run_index.shape
@@ -477,22 +479,22 @@ class NativeBatches:
         lock = threading.Lock()  # threads that ask for the same group wait for it
 
         @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
-        def of_group(group: int) -> native_peaks.NativeInputs:
+        def inputs_of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
             given = steps[batch_indices], extra_steps[batch_indices], substeps
-            return self.of_batches(batch_indices, *given)
+            return self.inputs_of_batches(batch_indices, *given)
 
         def integrate_block(block, mask):
             group, place = divmod(block, blocks)
             rows = slice(place * self.block_size, (place + 1) * self.block_size)
             with lock:
-                inputs = of_group(group)
+                inputs = inputs_of_group(group)
             return self.integrate(batches_of(block), mask, inputs_of_rows(inputs, rows))
 
         return integrate_block
 
     def integrate(self, batch_indices, mask, inputs: native_peaks.NativeInputs):
-        """Results (path, batch, ...) by name of batches with these inputs."""
+        """Results (path, batch, ...) by name of batches with the given inputs."""
         max_loads = self.program.shapes.max_loads
         if self.loops is not None:
             found = self.loops.integrate(batch_indices, max_loads, mask, inputs)
@@ -511,16 +513,16 @@ class NativeBatches:
 
 
 def _paths_and_wheels(program: Program, batches: Batches, batch_indices):
-    def of_batch(*values):
+    def paths_and_wheels(*values):
         loads = program.loads(*values)
         return loads.cubics(), loads.wheels
 
     values = batches.shared_values[batch_indices], batches.batched_values[batch_indices]
     with np.errstate(all="ignore"):
-        return vectorised(of_batch)(*values)
+        return vectorised(paths_and_wheels)(*values)
 
 
 def inputs_of_rows(inputs: native_peaks.NativeInputs, rows) -> native_peaks.NativeInputs:
-    """Inputs of some of the batches; what all share stays as it is."""
+    """Inputs of some rows of the batches; arrays of length one, which all share, are unchanged."""
     parts = (part if part is None or len(part) == 1 else part[rows] for part in inputs)
     return native_peaks.NativeInputs(*parts)

@@ -1,4 +1,4 @@
-"""What a sweep warns of: runs that fail, and what the modes left out change of its peaks."""
+"""Warnings of a sweep: failed runs, and errors of its peaks from truncated modes."""
 
 import warnings
 from collections.abc import Collection
@@ -70,7 +70,7 @@ def warn_of_failures(dataset: "xarray.Dataset") -> None:
 
 
 class TruncationWarning(UserWarning):
-    """Warning of a quantity that the modes of a case miss in part."""
+    """Warning of a quantity whose peaks have an error from truncated modes."""
 
 
 def is_corrected(case: Case) -> bool:
@@ -94,25 +94,25 @@ def warn_of_truncation(case: Case) -> None:
     )
 
 
-def static_shares(case: Case) -> dict[str, float]:
-    """Largest share that the modes miss of static deflections and rotations, by quantity.
+def static_missed_fractions(case: Case) -> dict[str, float]:
+    """Largest fraction of static deflections and rotations that the modes miss, by quantity.
 
-    At each sensor under a load there; a rotation, which may be zero there, under one at a quarter
-    of the span.
+    A deflection is taken under a load at the sensor; a rotation, which may be zero there, under a
+    load at a quarter of the span.
     """
-    return dict(_static_shares(structure_of(concrete_case(case))))
+    return dict(_static_missed_fractions(structure_of(concrete_case(case))))
 
 
 @remembered
-def _static_shares(structure: Case) -> dict[str, float]:
+def _static_missed_fractions(structure: Case) -> dict[str, float]:
     static = [
         sensor
         for sensor in structure.sensors
         if not (QUANTITIES[sensor.quantity].bends or QUANTITIES[sensor.quantity].time_derivative)
     ]
-    layout, shares = mesh_layout(structure), {}
+    layout, fractions = mesh_layout(structure), {}
     if not static or not is_supported(structure, layout):
-        return shares
+        return fractions
     for quantity in dict.fromkeys(sensor.quantity for sensor in static):
         derivative = QUANTITIES[quantity].x_derivative
         x = np.stack([sensor.position for sensor in static if sensor.quantity == quantity])
@@ -122,8 +122,8 @@ def _static_shares(structure: Case) -> dict[str, float]:
             for line in (unchecked_influence_line, modal_influence_line)
         )
         missing = np.where(exact == 0, 0.0, exact - of_modes)
-        shares[quantity] = float(np.max(np.abs(missing / np.where(exact == 0, 1.0, exact))))
-    return shares
+        fractions[quantity] = float(np.max(np.abs(missing / np.where(exact == 0, 1.0, exact))))
+    return fractions
 
 
 class WorstRun(NamedTuple):
@@ -134,13 +134,13 @@ class WorstRun(NamedTuple):
 
 
 def estimated_errors(case: Case, worst: dict[str, WorstRun]) -> dict[str, float]:
-    """Truncation errors of peaks relative to the largest, by quantity, where they are known.
+    """Truncation errors of peaks relative to the largest, by quantity, where they are estimated.
 
-    `worst` is the run with the largest peak of each quantity. Of deflections and rotations the
-    error is the static one; others are estimated from that run (see `truncation_changes`), without
-    a controller.
+    `worst` is the run with the largest peak of each quantity. Deflections and rotations have their
+    static error; errors of others are estimated from the worst run (see `truncation_changes`), if
+    it has no controller.
     """
-    errors, found_before = static_shares(case), {}
+    errors, found_before = static_missed_fractions(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
@@ -160,12 +160,12 @@ def estimated_errors(case: Case, worst: dict[str, WorstRun]) -> dict[str, float]
     return errors
 
 
-def _changes_in_run(case: Case, known: Collection[str]) -> Float[np.ndarray, " sensor"] | None:
-    """Truncation errors at the sensors; NaN where those of its quantity are known.
+def _changes_in_run(case: Case, estimated: Collection[str]) -> Float[np.ndarray, " sensor"] | None:
+    """Truncation errors at the sensors; NaN at sensors of quantities `estimated` before.
 
     None where no step is found.
     """
-    asked = np.array([sensor.quantity not in known for sensor in case.sensors])
+    asked = np.array([sensor.quantity not in estimated for sensor in case.sensors])
     sensors = tuple(
         sensor for sensor, is_asked in zip(case.sensors, asked, strict=True) if is_asked
     )
@@ -178,7 +178,7 @@ def _changes_in_run(case: Case, known: Collection[str]) -> Float[np.ndarray, " s
 
 
 def _truncation_of(case: Case) -> Float[Array, " sensor"] | None:
-    """`truncation_changes` of a run."""
+    """Truncation errors at all sensors of a case in one run; None where no step is found."""
     loads, model = load_set(case), modal_model(case, mesh_layout(case), has_coupling(case))
     case = without_later_vibration(case, model, loads)
     duration = float(case.run.duration)

@@ -28,9 +28,9 @@ PRECISION = 0.05  # half the interval of a fractile over it, with which realisat
 
 
 def interval_ranks(count: int, level: float, confidence: float = CONFIDENCE) -> tuple[int, int]:
-    """Ranks, from 1, between whose values the fractile of a level lies; 0 and count + 1 are open.
+    """Ranks, from 1, of the values that bound the fractile of a level; 0 and count + 1 are open.
 
-    Each side is missed with a probability of at most half of what the confidence leaves.
+    The fractile is beyond each bound with a probability of at most (1 - confidence) / 2.
     """
     from scipy.stats import binom
 
@@ -50,7 +50,7 @@ def least_count(level: float, confidence: float = CONFIDENCE) -> int:
     72 6
     """
     missed = (1 - confidence) / 2
-    return max(math.ceil(math.log(missed) / math.log(share)) for share in (level, 1 - level))
+    return max(math.ceil(math.log(missed) / math.log(base)) for base in (level, 1 - level))
 
 
 def realisation_statistics(
@@ -61,9 +61,9 @@ def realisation_statistics(
 ) -> dict[str, np.ndarray]:
     """Mean, fractile, their intervals, and number of realisations still needed, of each run.
 
-    "needed" are those until half the interval of the fractile is `precision` of it, as intervals
-    shrink with the root of their number, and until it is closed. Open ends are infinite. What
-    failed, NaN, is left out.
+    "needed" realisations close the interval of the fractile and shrink half of it to the fraction
+    `precision` of the fractile, as intervals shrink with the root of their number. Open ends are
+    infinite. Failed runs, NaN, are left out.
 
     >>> import numpy as np
     >>> from jaxbeam.sweeps.realisations import realisation_statistics
@@ -107,10 +107,10 @@ def peak_names(dataset: "xarray.Dataset") -> list[str]:
 
 
 def static_peaks(case: Case, addresses: Collection[str]) -> list[float]:
-    """Static peaks of the sensors, with which those of a sweep over addresses are compared.
+    """Static peaks of the sensors, to compare with those of a sweep over addresses.
 
-    NaN where a number at an address may change them, and for what has no static value. Speeds, and
-    profiles, change none.
+    NaN where a number at an address may change the static peak, and for quantities without a static
+    value. Speeds and profiles do not change static peaks.
     """
     changing = [one for one in addresses if not UNCHANGED.fullmatch(one)]
     found = []
@@ -136,8 +136,8 @@ def realisations(
 ) -> "xarray.Dataset":
     """Statistics of the peaks of a sweep over an address, along a dimension `statistic`.
 
-    Those of `realisation_statistics`, of each quantity and sensor. Raises ValueError for an address
-    that is not swept, or a level or confidence not between 0 and 1.
+    The statistics are those of `realisation_statistics`, for each quantity and sensor. Raises
+    ValueError for an address that is not swept, or a level or confidence not between 0 and 1.
     """
     import xarray
 

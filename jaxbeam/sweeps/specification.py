@@ -69,7 +69,7 @@ SCHEDULE_ADDRESS = re.compile(
     r"|sensors\.(\d+|\*)\.(sampling_period|delay|dropout|jitter)"
 )
 
-# What a store keeps of steps; a sweep that was begun with other contents is not continued.
+# Contents of the steps in a store; a sweep begun with other contents cannot be resumed.
 STORED_STEPS = "sizes of batches, extra steps, error"
 
 
@@ -80,8 +80,8 @@ class SweepSpecification:
     The runs are all combinations of the values, or with `paired` the first of each address, the
     second, and so on. `tolerance` is the relative error allowed of peaks, rounding in `single`
     precision excluded. A block of runs takes at most `block_bytes` of memory, if one run takes no
-    more. One of `several` sweeps of one structure shares its compiled programs with the others.
-    `profiles` are those of the runs, whose numbers are values of an axis, `PROFILE_NUMBER`.
+    more. `several` sweeps of one structure use the same compiled programs. `profiles` are those of
+    the runs, whose numbers are values of an axis, `PROFILE_NUMBER`.
     """
 
     case: Case
@@ -128,7 +128,7 @@ class SweepSpecification:
 
     @functools.cached_property
     def _sizes(self) -> RunSizes:
-        """Sizes of the runs that decide how much memory they take."""
+        """Sizes of the runs, from which their memory is computed."""
         swept = [values for name, values in self.axes.items() if name.endswith(".speed")]
         speeds = [float(concrete(load.speed)) for load in self.case.loads if hasattr(load, "speed")]
         speeds = np.concatenate([speeds, *swept])
@@ -140,10 +140,10 @@ class SweepSpecification:
 
     @functools.cached_property
     def sensor_groups(self) -> list[list[int]]:
-        """Numbers of the sensors whose peaks are integrated together: all, if memory allows it.
+        """Groups of sensor numbers whose peaks are integrated together: one, if memory allows it.
 
-        Those that are statically corrected are neighbours, as steps end where wheels pass them. A
-        controller reads all of them in each run.
+        Corrected sensors of a group are neighbours, as steps end where wheels pass them. With a
+        controller, which reads all sensors, there is one group.
         """
         sensors, runs = self.case.sensors, self.batches.run_index.shape[1]
         order = sorted(range(len(sensors)), key=lambda i: (sensors[i].bends, sensors[i].position))
@@ -156,13 +156,13 @@ class SweepSpecification:
 
     @functools.cached_property
     def _force_runner(self) -> ForceRunner | None:
-        """Runner of peaks in closed form; None where there is none."""
+        """Runner of peaks in closed form; None where the sweep has no closed form."""
         if self.histories or self.single or self.profiles:
             return None
         return force_runner(self.case, self.batches, self.tolerance, self.block_bytes)
 
     def runner(self, native: bool) -> AnyRunner:
-        """Runner of the batches in blocks: in closed form, or whose steps are in C if `native`.
+        """Runner of the batches in blocks: in closed form, or else with steps in C if `native`.
 
         Raises ValueError if positions along the beam change their order within the sweep.
         """
@@ -190,9 +190,9 @@ class SweepSpecification:
         return SensorGroups([Runner(case, *settings) for case in cases], groups)
 
     def resumed_runner(self, content: dict[str, Any]) -> AnyRunner:
-        """Runner of the sweep of a store with this content, in C if it was begun so.
+        """Runner that resumes the sweep of a store with this content, in C if it was begun in C.
 
-        So all blocks agree to the bit. Raises ValueError if the C code cannot be compiled here.
+        So all blocks are bit-identical. Raises ValueError if the C code cannot be compiled here.
         """
         native = bool(content["native"])
         same = dataclasses.replace(self, block_bytes=content["block_bytes"])
@@ -230,7 +230,7 @@ class SweepSpecification:
     def fingerprint(self) -> str:
         """SHA-256 of all that determines the results: case, values, settings and versions.
 
-        The memory of blocks is not among them: a sweep is continued with that of its beginning.
+        The memory of blocks is not included: a resumed sweep takes it from the store.
         """
         content = self.to_dict() | {
             "block_bytes": None,
@@ -330,10 +330,10 @@ def sweep_specification(
 
 
 def _rows_to_check(specification: SweepSpecification) -> list[dict[str, float]]:
-    """Values by address of runs that are valid only if all are.
+    """Values by address of the runs to check: all runs are valid if these are.
 
-    The valid values of one number are a range, so those runs are enough that have its smallest and
-    its largest value. Of numbers that are valid only in combination, all combinations.
+    The valid values of one number are a range, so that runs with its smallest and its largest value
+    are enough. All combinations are checked of numbers that are valid only in combination.
     """
     axes, runs = specification.axes, specification.runs()
     jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
@@ -359,7 +359,7 @@ def _rows_to_check(specification: SweepSpecification) -> list[dict[str, float]]:
 def _checked_values(
     case: Case, address: str, values_given: Any, numbers: dict[str, Any]
 ) -> Float[np.ndarray, " value"]:
-    """Values of one address as an array, with the checks that need no other address.
+    """Values of one address as an array (SI units), checked as far as one address allows.
 
     `numbers` are those of the case by address.
     """

@@ -2,9 +2,9 @@
 
 The longest step that meets a tolerance falls with the crossing rate of the loads, in a way that
 depends on the model. It is measured at a few crossing rates; in between, the shorter of the two
-next steps holds. The steps are then checked on a stratified sample of batches. Batches outside the
-sample may have larger errors where the response changes sharply from run to run: that of a heavy
-mass near its critical speed is ten times that of a slightly slower one.
+adjacent steps is taken. The steps are then checked on a stratified sample of batches. Batches
+outside the sample may have larger errors where the response changes sharply from run to run: the
+error of a heavy mass near its critical speed is ten times that of a slightly slower one.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -28,12 +28,13 @@ from jaxbeam.sweeps.batches import Batches, values_at
 
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
 REFINEMENT = 1.25  # ratio of a step to the finer step with which its error is measured
-# Of the errors allowed of runs over random profiles: others are up to three times as large.
-RANDOM_SHARE = 0.4
-WAVES_PER_STEP = 0.6  # of the shortest waves of a profile, at first, for errors of 1e-7
+# Fraction of the allowed error to aim at for random profiles: errors of other runs are up to three
+# times as large.
+RANDOM_FRACTION = 0.4
+WAVES_PER_STEP = 0.6  # initial step over the shortest wave of a profile, for errors of 1e-7
 MAX_ROUNDS = 12
 MEASURED_SAFETY = 2  # error stated / largest difference, where all runs are measured
-LEAST_SHARE = 0.3  # of the tolerance: least error stated where steps were searched for it
+LEAST_STATED_ERROR = 0.3  # relative to the tolerance, where steps were searched for it
 SAFETY_FACTOR = 6  # tolerance / largest error allowed in the sample
 TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
 # Errors relative to the error allowed from which steps are extrapolated unmeasured: the sample
@@ -41,11 +42,11 @@ TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
 MIN_USEFUL_ERROR, MAX_USEFUL_ERROR = 3e-3, 10
 LIMIT_RATIO = 1.3  # initial step / longest step from which on the longest is taken unmeasured
 SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of batches over this
-SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may be what no step lessens
-MOST_TRIALS = 4  # of a batch that are kept: those of two pairs
-NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
+SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may exceed the tolerance
+MOST_TRIALS = 4  # results kept of a batch: those of two pairs of runs
+NEGLIGIBLE_PEAK = 1e-6  # relative to a run's largest peak; errors of smaller peaks refer to it
 
-# Peaks (path, batch, sensor) of batches for their steps (s) and numbers of extra steps per panel.
+# Function from batch indices, steps (s) and extra steps per panel to peaks (path, batch, sensor).
 PeaksFunction = Callable[
     [Int[np.ndarray, " path"], Float[np.ndarray, " path"], Int[np.ndarray, " path"]], np.ndarray
 ]
@@ -66,11 +67,11 @@ def initial_step_sizes(
     return steps * (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER)
 
 
-def initial_share(quantities: Iterable[str]) -> float:
-    """Share of initial steps with which a search for those of some quantities begins.
+def initial_fraction(quantities: Iterable[str]) -> float:
+    """Factor on the initial steps for the measured quantities: 1 for deflections, less for others.
 
-    Their errors are those of higher modes. Of beams of one and two spans with 2 to 12 modes the
-    median steps are these shares: 0.9 for moments, 0.65 for shear forces, 0.25 for accelerations.
+    Higher modes dominate their errors. For beams of one and two spans with 2 to 12 modes the median
+    factors are 0.9 for moments, 0.65 for shear forces, 0.25 for accelerations.
     """
     in_x, in_time = (1.0, 0.9, 0.9, 0.65), (1.0, 0.45, 0.25)
     found = (QUANTITIES[name] for name in quantities)
@@ -80,11 +81,11 @@ def initial_share(quantities: Iterable[str]) -> float:
 def log_spaced_sample(
     crossing_rates: Float[np.ndarray, " path"], masses: Float[np.ndarray, " path"], count: int
 ) -> Int[np.ndarray, " sample"]:
-    """Indices of `count` batches: of those near each of evenly spaced log rates the heaviest.
+    """Indices of `count` batches: the heaviest near each of evenly spaced log crossing rates.
 
-    Errors grow with the masses of loads. Among equal ones it is the nearest; then the fastest is
-    among them, the slowest are not: they take longest, and their errors are least like those of
-    others. An index may occur twice.
+    Errors grow with the masses of loads. Among equal masses the nearest batch is chosen; then the
+    fastest is in the sample, the slowest are not: they take longest, and their errors differ most
+    from those of others. An index may occur twice.
     """
     order = np.argsort(crossing_rates, kind="stable")
     logs = np.log(crossing_rates[order])
@@ -104,10 +105,10 @@ def step_errors(
 ) -> Float[np.ndarray, " path"]:
     """Largest relative change of the peaks of each batch with steps REFINEMENT times finer.
 
-    At least one step is added to the `extra_steps` between events, of which there may be few. Runs
-    that fail are left out; NaN if all do.
+    The finer runs have one more of the `extra_steps` per panel, as few steps would not change
+    otherwise. Runs that fail are left out; NaN if all do.
     """
-    # The finer runs take longer: each half has those of every other batch.
+    # The finer runs take longer: each half has the finer runs of every other batch.
     fine_first = np.arange(len(batches)) % 2 == 0
     is_fine = np.append(fine_first, ~fine_first)
     both_steps = np.tile(steps, 2) / np.where(is_fine, REFINEMENT, 1.0)
@@ -123,7 +124,7 @@ def rounding_error(exact: Float[np.ndarray, "path batch sensor"], rounded: np.nd
 
 
 def largest_error(errors: Sequence[float] | np.ndarray) -> float:
-    """Largest of some errors that is known; NaN if none is, as of runs that all fail."""
+    """Largest error that is not NaN; NaN if all are, as where all runs fail."""
     return float(np.fmax.reduce(np.asarray(errors, float), initial=np.nan))
 
 
@@ -145,7 +146,7 @@ def _interpolate_conservatively(
     sampled_rates: Float[np.ndarray, " sample"],
     values: Float[np.ndarray, " sample"],
 ) -> Float[np.ndarray, " path"]:
-    """Smaller of the values at the two next sampled rates; the end value outside their range."""
+    """Smaller of the values at the two adjacent sampled rates; the end value beyond them."""
     unique, group = np.unique(sampled_rates, return_inverse=True)
     smallest = np.full(unique.size, np.inf)
     np.minimum.at(smallest, group, values)
@@ -176,18 +177,19 @@ def choose_step_sizes(
     tolerance: float,
     all_measured: bool = False,
     few_peaks: PeaksFunction | None = None,
-    search_share: float = 1.0,
+    search_fraction: float = 1.0,
 ) -> tuple[Float[np.ndarray, " path"], Int[np.ndarray, " path"], float]:
-    """Longest steps (s) of all batches for a tolerance, extra steps, and the error of their runs.
+    """Longest steps (s) of all batches for a tolerance, extra steps, and the stated error.
 
-    That is SAFETY_FACTOR times the largest error of the sample: of random sweeps of beams of one
-    and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
+    The stated error is SAFETY_FACTOR times the largest of the sample: in random sweeps of beams of
+    one and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
 
     The search over `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts
-    from `initial_steps` (s) and is limited by `max_steps` (s); it takes `few_peaks`, those of few
-    runs of the batches, if they are given, and allows a share of the error. The steps are then
-    checked on a stratified sample, or the errors of all batches are measured (`_measured_steps`).
-    Raises RuntimeError if no step meets the tolerance. The error is NaN if all runs fail.
+    from `initial_steps` (s) and is limited by `max_steps` (s); it takes `few_peaks`, the peaks of
+    few runs of the batches, if they are given, and aims at `search_fraction` of the allowed error.
+    The steps are then checked on a stratified sample, or the errors of all batches are measured
+    (`_measured_steps`). Raises RuntimeError if no step meets the tolerance. The error is NaN if all
+    runs fail.
     """
     target_error = tolerance / (MEASURED_SAFETY if all_measured else SAFETY_FACTOR)
     chosen = log_spaced_sample(crossing_rates, masses, count)
@@ -196,7 +198,7 @@ def choose_step_sizes(
         chosen,
         initial_steps[chosen],
         max_steps[chosen],
-        search_share * target_error,
+        search_fraction * target_error,
     )
     if not np.all(valid_steps > 0):
         raise _no_step_error(tolerance)
@@ -217,7 +219,7 @@ def choose_step_sizes(
     for _ in range(MAX_ROUNDS):
         found = step_errors(peaks, sample[fails], steps[sample[fails]])
         error[fails] = found
-        fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
+        fails, measured = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
             return steps, nothing, SAFETY_FACTOR * largest_error(error)
         with np.errstate(divide="ignore"):
@@ -225,7 +227,7 @@ def choose_step_sizes(
         # Only up to the next batches of the sample, whose steps are short enough.
         factor = np.where(fails, factor, 1.0)
         steps = steps * _interpolate_conservatively(
-            crossing_rates, crossing_rates[sample[known]], factor[known]
+            crossing_rates, crossing_rates[sample[measured]], factor[measured]
         )
     raise _no_step_error(tolerance)
 
@@ -236,15 +238,15 @@ def _measured_steps(
     max_steps: Float[np.ndarray, " path"],
     tolerance: float,
 ) -> tuple[Float[np.ndarray, " path"], Int[np.ndarray, " path"], float]:
-    """Steps (s) of batches all of which are measured, extra steps in each panel, and their error.
+    """Steps (s) of batches from errors measured in all of them, extra steps, and the stated error.
 
-    The results of each are those of the finer of two runs, whose peaks differ by no more than half
-    the tolerance. Its own error is a quarter of the difference in the median of 288 runs of trucks
-    and quarter cars over random profiles, with REFINEMENT**-CONVERGENCE_ORDER for a sixth, and 2.6
-    times it at most where the difference is more than rounding. The error is MEASURED_SAFETY times
-    the largest difference, and, as two peaks may agree by chance, no less than LEAST_SHARE of the
-    tolerance, unless the longest steps meet it. Of runs that differ by more the finer one becomes
-    the coarser of the next pair, unless it would still be much too coarse.
+    Each batch is run with two steps, whose peaks may differ by half the tolerance; the finer run is
+    its result. In 288 runs of trucks and quarter cars over random profiles the error of the finer
+    run was a quarter of the difference in the median (REFINEMENT**-CONVERGENCE_ORDER predicts a
+    sixth), and 2.6 times it at most where the difference is more than rounding. The stated error is
+    MEASURED_SAFETY times the largest difference, and, as two peaks may agree by chance, no less
+    than LEAST_STATED_ERROR of the tolerance, unless the longest steps meet it. Where runs differ by
+    more, the finer one becomes the coarser of the next pair, unless it is still much too coarse.
     """
     allowed = tolerance / MEASURED_SAFETY
     steps, extra = steps.copy(), np.zeros(steps.size, int)
@@ -254,7 +256,8 @@ def _measured_steps(
         error[left] = found
         left = left[found > allowed]
         if not left.size:
-            least = LEAST_SHARE * tolerance * np.any((steps < max_steps) & ~np.isnan(error))
+            searched = np.any((steps < max_steps) & ~np.isnan(error))
+            least = LEAST_STATED_ERROR * tolerance * searched
             stated = max(MEASURED_SAFETY * largest_error(error), least)
             return steps / REFINEMENT, extra + 1, stated
         with np.errstate(divide="ignore"):
@@ -272,7 +275,7 @@ def _search_step_sizes(
     max_steps,
     tolerance: float,
 ):
-    """Longest steps (s) of batches that meet a tolerance, 0 without one; whether any run succeeds.
+    """Longest steps (s) of batches that meet a tolerance, or 0; and whether any run succeeds.
 
     Batches are in the order of their crossing rates.
     """
@@ -326,11 +329,11 @@ def _no_step_error(tolerance: float) -> RuntimeError:
 
 
 class Trials:
-    """Latest results of batches by name, with their steps (s) and extra steps in each panel.
+    """Latest results of batches by name, by their steps (s) and extra steps in each panel.
 
-    Four of the 64 batches of 4096 crossings are checked with their final steps: a sixteenth less
-    is left to be computed. Of sweeps of few batches all are measured, and nothing is left. A batch
-    has the results of the last runs, of which pairs are compared.
+    Trial runs with the final steps are results of the sweep: 4 of the 64 batches of 4096 crossings,
+    and all batches of sweeps of few. The latest runs of each batch are kept, as pairs of them are
+    compared.
     """
 
     def __init__(self):
@@ -351,13 +354,13 @@ class Trials:
             while len(kept) > MOST_TRIALS:
                 kept.pop(next(iter(kept)))
 
-    def known(
+    def has_results(
         self,
         batch_indices: Int[np.ndarray, " path"],
         steps: Float[np.ndarray, " path"],
         extra_steps: Int[np.ndarray, " path"],
     ) -> Bool[np.ndarray, " path"]:
-        """Whether the results of batches are known for these steps."""
+        """Whether results of the batches are kept for the given steps."""
         rows = zip(*(part.tolist() for part in (batch_indices, steps, extra_steps)), strict=True)
         return np.array([(step, more) in self._latest.get(i, {}) for i, step, more in rows], bool)
 
@@ -367,42 +370,42 @@ class Trials:
         batch_indices: Int[np.ndarray, " path"],
         steps: Float[np.ndarray, " path"],
         extra_steps: Int[np.ndarray, " path"],
-        known: Bool[np.ndarray, " path"],
+        is_stored: Bool[np.ndarray, " path"],
     ) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) of batches with those that are known; they may be all."""
-        own = {
+        """Results (path, batch, ...) of batches, completed by kept results of stored batches."""
+        stored = {
             row: self._latest[int(batch_indices[row])][float(steps[row]), int(extra_steps[row])]
-            for row in np.flatnonzero(known)
+            for row in np.flatnonzero(is_stored)
         }
-        if known.all():
-            return {name: np.stack([one[name] for one in own.values()]) for name in own[0]}
+        if is_stored.all():
+            return {name: np.stack([one[name] for one in stored.values()]) for name in stored[0]}
         results = {name: np.array(values) for name, values in results.items()}
-        for row, of_batch in own.items():
+        for row, of_batch in stored.items():
             for name, values in of_batch.items():
                 results[name][row] = values
         return results
 
 
-# `LoadEvents` of all paths, of known numbers.
+# `LoadEvents` of all paths, of concrete numbers.
 PathEvents = tuple[Float[np.ndarray, "path wheel 2"], Float[np.ndarray, "path event"]]
 
 
 class PathTimes(NamedTuple):
-    """Times of paths: of load events (s), and the longest steps of forces (s)."""
+    """Load events (s) of paths, and the longest steps (s) that resolve their forces."""
 
     load_events: LoadEvents
     force_steps: Array
 
 
 def path_times(case, addresses, shared_values, places) -> PathTimes:
-    """Times of all paths, those at which wheels pass some places (m) included.
+    """Load events of all paths, including wheels that pass some places (m); longest force steps.
 
-    Compiled only where they cannot be vectorised, as with values of tables of positions.
+    Compiled only where vectorising fails, as with values of tables of positions.
     """
-    known = concrete_case(case)
+    concrete_numbers = concrete_case(case)
     try:
         with np.errstate(all="ignore"):  # as in compiled code
-            return vectorised(lambda values: _times(known, addresses, values, places))(
+            return vectorised(lambda values: _times(concrete_numbers, addresses, values, places))(
                 shared_values
             )
     except NotVectorisedError:
@@ -436,7 +439,9 @@ def step_limits(
     longest: float | None,
     tolerance: float,
 ) -> StepLimits:
-    """Limits of batches, from their longest stable steps (s), infinite where there is none.
+    """Crossing rates and limits of the steps of batches.
+
+    `stable_steps` (s) are the longest stable steps, infinite where there is none.
 
     No step is longer than `longest` (s), if it is given.
     """
@@ -451,7 +456,7 @@ def step_limits(
     if longest is not None:
         max_steps = np.minimum(max_steps, longest)
     initial = initial_step_sizes(crossing_time, limits, case.beam.modes, tolerance)
-    initial = initial * initial_share(sensor.quantity for sensor in case.sensors)
+    initial = initial * initial_fraction(sensor.quantity for sensor in case.sensors)
     if isinstance(case.profile, AbstractSpectralProfile):
         shortest = 1 / np.max(concrete(case.profile.lines()[0]))
         of_wave = WAVES_PER_STEP * shortest / float(concrete(case.beam.length)) * crossing_time

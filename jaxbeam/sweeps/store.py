@@ -137,7 +137,7 @@ def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
     """
     import zarr
 
-    # Written beside the path and renamed, so that a store is complete or does not exist.
+    # Written next to the path and renamed, so that a store is complete or does not exist.
     temporary_path = path.with_name(f".{path.name}.start")
     shutil.rmtree(temporary_path, ignore_errors=True)
     try:

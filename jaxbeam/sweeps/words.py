@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
 
-MOST_KNOWN = 2  # sweeps, each of a few runs, that NumPy computes sooner than a program compiles
+MOST_UNCOMPILED = 2  # sweeps of a few runs each that NumPy computes sooner than a program compiles
 Words = tuple[str, ...] | tuple[int, ...]
 
 
@@ -129,7 +129,7 @@ def split_words(case: Case, over: dict[str, Any]) -> tuple[dict[str, Words], dic
 
 
 def _is_count(case: Case, address: str) -> bool:
-    """Whether a case has a whole number that is no number of its equations at an address."""
+    """Whether an address of a case is a count, as a seed: an integer outside its equations."""
     entry: Any = case_to_dict(case, whole=True)
     for key in address.split("."):
         if isinstance(entry, list):
@@ -150,7 +150,7 @@ def word_sweep(
     precision: str,
     memory: float | str | None = None,
 ) -> WordSweep:
-    """Sweep over all combinations of words and numbers, `order` that of the addresses.
+    """Sweep over all combinations of words and numbers; `order` is that of the addresses.
 
     Raises ValueError for words that the case cannot have, paired values, words that change the
     sensors, and as `sweep_specification`, with the words.
@@ -182,7 +182,7 @@ def word_sweep(
         if [str(s.quantity) for s in changed.sensors] != [str(s.quantity) for s in case.sensors]:
             raise ValueError(f"{named} changes the sensors, which all runs share: make two sweeps")
         cases.append(changed)
-    if len(sweeps) > MOST_KNOWN:
+    if len(sweeps) > MOST_UNCOMPILED:
         sweeps = [dataclasses.replace(part, several=True) for part in sweeps]
     dims = tuple(attribute_address(address) for address in order)
     plan = WordSweep(case, words, dims, cases, sweeps)
@@ -217,19 +217,19 @@ def compute_word_sweep(
     if path is not None and state == "new":
         with new_store(path, fingerprint):
             pass
-    known: dict[int, xarray.Dataset] = {}
+    computed: dict[int, xarray.Dataset] = {}
     if path is None:
         for group in _alike_but_for_profiles(plan.sweeps):
             found = _computed_together([plan.sweeps[i] for i in group], progress_bar)
-            known |= zip(group, found, strict=False)
+            computed |= zip(group, found, strict=False)
     for i, part in enumerate(plan.sweeps):
         part_path = None if path is None else path / BLOCKS_GROUP / str(i)
-        if i not in known:
-            known[i] = _compute_part(part, part_path, client, progress_bar)
-    datasets = [known[i] for i in range(len(plan.sweeps))]
+        if i not in computed:
+            computed[i] = _compute_part(part, part_path, client, progress_bar)
+    datasets = [computed[i] for i in range(len(plan.sweeps))]
     joined = plan.join(datasets)
-    for quantity, share in _estimates(plan, datasets).items():
-        joined[f"peak_{quantity}"].attrs["truncation_error"] = share
+    for quantity, error in _estimates(plan, datasets).items():
+        joined[f"peak_{quantity}"].attrs["truncation_error"] = error
     if set(plan.sweeps[0].dims) - set(plan.dims):  # words alone
         joined = joined.isel({dim: 0 for dim in plan.sweeps[0].dims}, drop=True)
     joined.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
@@ -239,7 +239,7 @@ def compute_word_sweep(
 
 
 def _alike_but_for_profiles(sweeps: Sequence[SweepSpecification]) -> list[list[int]]:
-    """Numbers of several sweeps whose runs differ in their profiles alone, of which C knows."""
+    """Groups of numbers of sweeps that differ only in profiles which the C integrator takes."""
     groups: dict[str, list[int]] = {}
     for i, part in enumerate(sweeps):
         if profiles_of_runs([part.case.profile]) is not None:
@@ -252,9 +252,9 @@ def _alike_but_for_profiles(sweeps: Sequence[SweepSpecification]) -> list[list[i
 def _computed_together(
     parts: Sequence[SweepSpecification], progress_bar: ProgressBar
 ) -> "list[xarray.Dataset]":
-    """Datasets of sweeps that are alike but for their profiles, as runs of one; none without C.
+    """Datasets of sweeps that differ only in profiles, computed as one sweep; none without C.
 
-    What depends on the paths of the loads is computed once for all of them.
+    Matrices that depend on the paths of the loads are computed once for all.
     """
     first = parts[0]
     profiles = [part.case.profile for part in parts]
@@ -273,7 +273,7 @@ def _computed_together(
 
 
 def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[str, float]:
-    """Truncation errors by quantity, each of the words with the largest peak of it."""
+    """Truncation error of each quantity, of the combination of words with its largest peak."""
     errors = {}
     for quantity in {sensor.quantity for sensor in plan.case.sensors}:
         peaks = [part[f"peak_{quantity}"].max().item() for part in datasets]
@@ -281,7 +281,7 @@ def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[st
         part, run = plan.sweeps[worst], worst_runs(plan.sweeps[worst], datasets[worst])
         of_quantity = {q: run[q] for q in run if q == quantity}
         found = estimated_errors(part.case, of_quantity)
-        errors |= {q: share for q, share in found.items() if q == quantity}
+        errors |= {q: error for q, error in found.items() if q == quantity}
     return errors
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from jaxbeam.sweeps.step_size import (
-    LEAST_SHARE,
+    LEAST_STATED_ERROR,
     LIMIT_RATIO,
     SAFETY_FACTOR,
     choose_step_sizes,
@@ -158,7 +158,7 @@ def test_peaks_that_agree_by_chance_do_not_make_the_error_small():
     changed = peaks_with_error(np.full(3, 0.1), order=30)
     given = rates, rates, np.full(3, 0.058), np.full(3, 0.1), 4, 1e-6
     *_, error = choose_step_sizes(changed, *given, all_measured=True)
-    assert error >= LEAST_SHARE * 1e-6
+    assert error >= LEAST_STATED_ERROR * 1e-6
 
 
 def test_no_step_meets_the_tolerance():

@@ -105,7 +105,7 @@ def test_the_time_grid_is_the_same_with_known_load_events():
     for i, speed in enumerate(speeds):
         varied = replace(case, {"loads.0.speed": speed})
         found, expected = (
-            grid_by_step_length(varied, model, np.asarray(1e-2), known_events=known)
+            grid_by_step_length(varied, model, np.asarray(1e-2), given_events=known)
             for known in (jax.tree.map(lambda part, i=i: part[i], events), None)
         )
         assert eqx.tree_equal(found, expected)

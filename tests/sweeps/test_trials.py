@@ -27,7 +27,7 @@ def test_only_results_with_the_same_steps_are_known():
         np.array([0.3, 0.3, 0.2, 0.4, 0.1]),
         np.array([1, 0, 0, 0, 0]),
     )
-    known = trials.known(*given)
+    known = trials.has_results(*given)
     assert known.tolist() == [True, False, False, True, False]
     found = trials.completed({"peak": np.full((5, 2), -1.0)}, *given, known)["peak"].tolist()
     assert found == [[4.0, 5.0], [-1.0, -1.0], [-1.0, -1.0], [8.0, 9.0], [-1.0, -1.0]]
