@@ -1,8 +1,8 @@
-"""Contact forces within steps and at their ends: the smallest, and the first that are tensile.
+"""Contact forces within steps and at their ends: smallest force, and first loss of contact.
 
 Within a step a contact force is the polynomial through its values at the Gauss nodes. It is
-compared at fractions of the step, the ends among them, and at the vertices of the parabolas through
-three of these. `runtime/native/contact.c` does the same in C.
+compared at fractions of the step, which include the ends, and at the vertices of the parabolas
+through three of these. `runtime/native/contact.c` does the same in C.
 
 Peaks of statically corrected outputs often are at an end, where an axle stands on a sensor. An
 extrapolation of the forces at the Gauss nodes is the least accurate there; the states are the most
@@ -33,15 +33,15 @@ FORCE_GAP = float(np.diff(FORCE_FRACTIONS).max())
 
 
 def force_weights_at_fractions() -> Float[np.ndarray, "fraction node"]:
-    """Weights from contact forces at the Gauss nodes of a step to those at FORCE_FRACTIONS."""
+    """Weights that interpolate contact forces at the Gauss nodes of a step to FORCE_FRACTIONS."""
     powers = FORCE_FRACTIONS[:, None] ** np.arange(NODE_COUNT)
     return powers @ lagrange_coefficients(NODE_COUNT).T
 
 
 def spread_factor() -> float:
-    """Bound of a force beyond the middle of its values at the Gauss nodes, over their spread.
+    """Bound of the distance of a force from the middle of its nodal values, over their spread.
 
-    Half the Lebesgue constant of the nodes, which is that at the ends of the step.
+    It is half the Lebesgue constant of the Gauss nodes, which is reached at the ends of the step.
     """
     return 0.5 * float(np.abs(force_weights_at_fractions()).sum(axis=1).max())
 
@@ -56,9 +56,9 @@ def contact_minimum(
 ) -> tuple[Float[Array, "load batch"], Float[Array, "load batch"]]:
     """Smallest forces (N, positive where a load presses) and times of the first loss (s), updated.
 
-    `forces` are those on the beam at the Gauss nodes of steps, positive upwards; `is_load` says
-    which load a row is. Times are NEVER without a loss, which is the first zero of the polynomial,
-    or the start of a step with a pull.
+    `forces` act on the beam at the Gauss nodes of steps, positive upwards; `is_load` marks the load
+    of each row. The loss of contact is the first zero of the polynomial, or the start of a step
+    that begins with a tensile force; its time is NEVER without a loss.
     """
     if not is_load.size:  # of a case without loads
         return lowest, lost_time
@@ -103,9 +103,10 @@ def contact_minimum(
 
 
 def _at_fractions(by_row: Float[Array, "step row node batch"], by_product: bool):
-    """Pulls at the FORCE_FRACTIONS, as a sum that XLA computes along with what follows it.
+    """Tensile forces at the FORCE_FRACTIONS, (fraction, step, row, batch).
 
-    Or as one product, of which a program is smaller.
+    The sum is one that XLA fuses with the operations after it; `by_product` it is one product,
+    which makes a smaller program.
     """
     if by_product:
         return xp.einsum("fn,slnb->fslb", force_weights_at_fractions(), by_row)
@@ -114,9 +115,10 @@ def _at_fractions(by_row: Float[Array, "step row node batch"], by_product: bool)
 
 
 def _parabolas() -> tuple[Float[np.ndarray, "inner fraction"], ...]:
-    """Weights of the parabolas through three fractions, from the values at all fractions.
+    """Weights of the values at all fractions in the parabolas through three fractions.
 
-    Slopes before and after the middle one, the slope at it, and half the second derivative.
+    They give the slopes before and after the middle fraction, the slope at it, and half the second
+    derivative.
     """
     gaps = np.diff(FORCE_FRACTIONS)[:, None]
     slopes = np.diff(np.eye(FORCE_FRACTIONS.size), axis=0) / gaps
@@ -129,7 +131,7 @@ PARABOLAS = _parabolas()
 
 
 def _vertices(pulls: Float[Array, "fraction step row batch"]):
-    """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
+    """Maxima of the parabolas through three fractions, -inf without one, and their rising zeros."""
     rise, fall, slope, curvature = (xp.tensordot(weights, pulls, 1) for weights in PARABOLAS)
     inside = (rise > 0) & (fall < 0) & (curvature < 0)  # which rounding of a level pull may not be
     curvature = xp.where(inside, curvature, -1.0)
@@ -139,15 +141,16 @@ def _vertices(pulls: Float[Array, "fraction step row batch"]):
 
 
 def _first_loss(pulls, vertex, rising) -> Float[Array, "step row batch"]:
-    """First fraction of each step with a pull, NEVER without one.
+    """Fraction of each step at which the force first becomes tensile, NEVER without one.
 
-    By the line between two fractions, or by the parabola if there is a pull only between them.
+    It is found on the line between two fractions, or on the parabola if the force is tensile only
+    between them.
     """
     before, after = pulls[:-1], pulls[1:]
     rises = (before <= 0) & (after > 0)
-    share = before / xp.where(rises, before - after, 1.0)
+    fraction = before / xp.where(rises, before - after, 1.0)
     starts, gaps = FORCE_FRACTIONS[:-1], np.diff(FORCE_FRACTIONS)
-    crossing = starts[:, None, None, None] + gaps[:, None, None, None] * share
+    crossing = starts[:, None, None, None] + gaps[:, None, None, None] * fraction
     first = xp.min(xp.where(rises, crossing, NEVER), axis=0)
     touching = (vertex > 0) & (pulls[1:-1] <= 0)
     first = xp.minimum(first, xp.min(xp.where(touching, rising, NEVER), axis=0))
@@ -157,7 +160,7 @@ def _first_loss(pulls, vertex, rising) -> Float[Array, "step row batch"]:
 def _moving_zero(
     powers: Float[Array, "power step row batch"], zero: Float[Array, "step row batch"]
 ) -> Float[Array, "step row batch"]:
-    """The same zero, with the derivative of the instant at which the polynomial is zero."""
+    """`zero` with the derivative of the instant at which the polynomial is zero."""
     if not is_jax(powers):
         return zero
     inside = (zero > 0) & (zero < NEVER)
@@ -176,10 +179,10 @@ def _slopes(powers: Float[Array, "power *rest"]) -> Float[Array, "power_less_one
 def _zero_nearby(
     powers: Float[Array, "power step row batch"], start: Float[Array, "step row batch"]
 ) -> Float[Array, "step row batch"]:
-    """Zero of a polynomial within a gap of FORCE_FRACTIONS of its start; starts 0 and NEVER stay.
+    """Zero of a polynomial within a gap of FORCE_FRACTIONS of a start; 0 and NEVER are kept.
 
-    By Newton's method; a start stays, too, if that ends farther from zero. The line between two
-    fractions misses the zero by up to 1e-3 of the step.
+    It is found by Newton's method; the start is kept if that ends farther from zero. The line
+    between two fractions misses the zero by up to 1e-3 of the step.
     """
     inside = (start > 0) & (start < NEVER)
     first = xp.where(inside, start, 0.5)
@@ -196,11 +199,12 @@ def _zero_nearby(
     return xp.where(inside & nearer, found, start)
 
 
-END_FRACTIONS = (1e-9, 1.0 - 1e-9)  # of a step: limits within, where accelerations of loads jump
+# Fractions of a step for limits from within at its ends, where accelerations of loads jump.
+END_FRACTIONS = (1e-9, 1.0 - 1e-9)
 
 
 class EndRows(Module):
-    """Wheels at the two ends of steps: mode shapes, rows of accelerations, and height rates.
+    """Rows of the wheels at the two ends of steps: mode shapes, accelerations, and profile.
 
     `accelerations` map states to the accelerations under the wheels, `surface` is the second rate
     of the profile's height there (m/s^2), None without a profile.
@@ -214,7 +218,7 @@ class EndRows(Module):
 def end_rows(
     model: ModalModel, loads: LoadSet, start, length, load_index, on_beam
 ) -> EndRows | None:
-    """Wheels at the ends of steps; None where no contact law is solved: forces, and vehicles."""
+    """Rows of the wheels at the ends of steps; None for massless forces and for vehicles."""
     if loads.massless or loads.wheels.vehicles:
         return None
     times = start[:, None] + length[:, None] * xp.asarray(END_FRACTIONS, length.dtype)
@@ -244,8 +248,8 @@ def end_forces(
 ) -> Float[Array, "step row_end batch"]:
     """Contact forces (N) of wheels at the ends of steps, from the states there.
 
-    States are those `before` each step, and the `last` after all of them. Without `rows`
-    forces are extrapolated from those at the Gauss nodes.
+    States are those `before` each step, and the `last` after all steps. Without `rows` forces are
+    extrapolated from those at the Gauss nodes.
     """
     steps, count, batch = forces.shape
     nodes = end_weights().shape[0]
@@ -271,8 +275,8 @@ def _at_ends(
 ) -> Float[Array, "step end load batch"]:
     """Products of rows at the two ends of steps with the states there.
 
-    Where a step ends the next one begins, so that both rows act on the states before the steps:
-    these, by far the largest part, are read once and not copied.
+    A step ends where the next one begins, so that both rows act on the states before the steps.
+    These states, by far the largest array, are read once and not copied.
     """
     at_end = rows[:, 1]
     of_former = xp.concatenate([xp.zeros_like(at_end[:1]), at_end[:-1]])

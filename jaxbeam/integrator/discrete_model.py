@@ -36,9 +36,9 @@ def monitored_rows(
 ]:
     """Rows of outputs on the state at the start of a step and on the forces at its Gauss nodes.
 
-    `rows` are those on states at the same instant, `on_commands` on commands. Samples are the
-    outputs at each peak node, one node after the other; inputs are the generalised forces, then the
-    commands, both polynomials through the Gauss nodes.
+    `rows` act on states at the same instant, `on_commands` on commands. Samples are the outputs at
+    each peak node, one node after the other; inputs are the generalised forces, then the commands,
+    both polynomials through the Gauss nodes.
     """
     blocks, side, _ = model.state_matrix.shape
     on_side = rows.reshape(-1, blocks, side)
@@ -62,10 +62,10 @@ def commands_at_once(
     command_rates: Float[Array, "mode command"],
     corrected: CorrectionRows | None,
 ) -> Float[Array, "output command"]:
-    """What commands change of outputs at the same instant.
+    """Direct response of outputs to commands at the same instant.
 
-    `command_rates` are the accelerations of the modes, which accelerations follow; the active
-    moments of actuators are part of section forces.
+    Outputs of accelerations respond to the modal accelerations `command_rates` of unit commands,
+    section forces to the active moments of actuators.
     """
     accelerations: Any = outputs.has_feedthrough[:, None] * outputs.rows
     if corrected is not None and corrected.accelerations is not None:
@@ -79,7 +79,7 @@ def commands_at_once(
 
 
 def _at_peak_nodes(propagators: Propagators):
-    """Propagators (length, sample, ...) to the start, the Gauss nodes and the end of a step."""
+    """Propagators (length, sample, ...) to the peak nodes: start, Gauss nodes and end of a step."""
     identity = xp.broadcast_to(
         xp.eye(propagators.transition_end.shape[-1]), propagators.transition_end.shape
     )
@@ -97,7 +97,7 @@ def _at_peak_nodes(propagators: Propagators):
 
 
 def force_weights_at_peaks() -> np.ndarray:
-    """Weights (sample, force) from forces at the Gauss nodes to those at the peak nodes."""
+    """Weights (sample, force) that interpolate forces at the Gauss nodes to the peak nodes."""
     powers = np.array(PEAK_NODES)[:, None] ** np.arange(NODE_COUNT)
     return powers @ lagrange_coefficients(NODE_COUNT).T
 
@@ -105,12 +105,12 @@ def force_weights_at_peaks() -> np.ndarray:
 def bounds_by_energy(
     model: ModalModel, outputs: OutputRows, corrected: CorrectionRows | None = None
 ) -> Float[Array, "output block"]:
-    """Bounds of free outputs by the energies E = q'^2 + q K q of the blocks of a model.
+    """Bounds of outputs in free vibration by the energies E = q'^2 + q K q of the blocks.
 
-    An output is at most the sum over the blocks of its bound times sqrt(E). Blocks do not couple,
-    so that no E grows. Infinite with rigid-body modes. For a row s on the q of a block it is
-    sqrt(s K^-1 s); on q', sqrt(s s); on q'' = -K q - D q', sqrt(s K s) + |D s|; of an output with
-    more than one row, the sum.
+    An output is at most the sum over the blocks of its bound times sqrt(E). Blocks are uncoupled,
+    so that E does not grow. The bound is infinite with rigid-body modes. For a row s on the q of a
+    block it is sqrt(s K^-1 s); on q', sqrt(s s); on q'' = -K q - D q', sqrt(s K s) + |D s|; for an
+    output with more than one row, their sum.
     """
     blocks, orders = model.state_matrix.shape[0], np.array(outputs.time_derivatives, int)
     bounds = xp.zeros((orders.size, blocks))
@@ -153,8 +153,8 @@ def _root_of_static_flexibility(
 ) -> Float[Array, "position block"]:
     """Root of the static deflection (m/N) of each block at positions under a unit force there.
 
-    Infinite with rigid-body modes. Uncoupled modes need no factorisation, which would dominate the
-    time.
+    Infinite with rigid-body modes. Uncoupled modes are divided by their stiffness, as a
+    factorisation would dominate the time.
     """
     if model.modes_per_block == 1:
         return xp.abs(shapes) / xp.sqrt(-model.state_matrix[:, 1, 0])
@@ -168,8 +168,9 @@ class DiscreteModel(Module):
 
     Outputs are deflections, or other quantities of sensors. `energy_bounds` bound each of them by
     the energies of the blocks (see `bounds_by_energy`). With `with_node_states`, step matrices
-    include the states at the nodes. `load_influence` is that of outputs that forces change at once.
-    Peaks are those of the `magnitude` of an output, by default its absolute value.
+    include the states at the nodes. `load_influence` is the direct influence of forces on outputs
+    with a static correction. Peaks are those of the `magnitude` of an output, by default its
+    absolute value.
     """
 
     model: ModalModel
@@ -199,9 +200,8 @@ def discrete_model(
 ) -> DiscreteModel:
     """Modal model on a time grid, with deflections monitored at `positions` (m), if any.
 
-    An input policy adds the commands, and the states at the nodes if it is implicit. `outputs` are
-    monitored in place of the deflections: sums of the modes, accelerations with the forces, and
-    with their static `correction`, if it is given.
+    An input policy adds the commands, and the states at the nodes if it is implicit. `outputs`, if
+    given, are monitored in place of deflections, with their static `correction`, if it is given.
     """
     with_commands = policy is not None
     with_node_states = policy is not None and policy.implicit
@@ -233,7 +233,7 @@ def discrete_model(
 
 
 def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
-    """Same model with each position monitored twice: upward deflections, then downward ones."""
+    """Discrete model that monitors each position twice: upward deflections, then downward ones."""
 
     def both_signs(rows):
         split = rows.reshape(

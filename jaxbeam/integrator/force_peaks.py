@@ -1,9 +1,9 @@
-"""Peaks of runs under forces at constant speeds: search where bounds allow one.
+"""Peaks of runs under forces at constant speeds, searched only where bounds allow a peak.
 
 Between two instants a time h apart an output y is at most h^2 / 8 max |y''| above the larger of its
-values there. Of free vibration y'' is bounded by the amplitudes of its poles, of the forces by the
-tables (see `ForceResponses`). So most of a run is left out without a look, and no peak is missed:
-what is left out is below a value that is reached.
+values there. The y'' of free vibration is bounded by the amplitudes of its poles, that of the
+forces by the tables (see `ForceResponses`). So most of a run need not be searched, and no peak is
+missed: outputs there are below a value that is reached elsewhere.
 
 Panels are the intervals between the passages of breaks by forces.
 """
@@ -32,7 +32,7 @@ from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
 
 class ForcePaths(NamedTuple):
-    """Forces upwards (N) at x = origin + speed t (m, m/s) until the `duration` (s) of each run."""
+    """Moving forces: upwards (N) at x = origin + speed t (m, m/s), until the `duration` (s)."""
 
     origin: Float[np.ndarray, "run wheel"]
     speed: Float[np.ndarray, "run wheel"]
@@ -42,13 +42,13 @@ class ForcePaths(NamedTuple):
     def passages(
         self, places: Float[np.ndarray, " place"]
     ) -> tuple[Float[np.ndarray, "run wheel place"], Bool[np.ndarray, "run wheel place"]]:
-        """Times (s) at which the forces pass places, within the run, and whether they do in it."""
+        """Times (s) at which forces pass places, clipped to the run, and whether they are in it."""
         times = (places - self.origin[..., None]) / self.speed[..., None]
         end = self.duration[:, None, None]
         return np.clip(times, 0.0, end), (times >= 0) & (times < end)
 
     def windows(self, left: float, right: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times (s) from and until which the forces (run, wheel) are between two ends (m)."""
+        """Times (s) at which the forces (run, wheel) enter and leave between two ends (m)."""
         times, _ = self.passages(np.array([left, right]))
         return times.min(axis=-1), times.max(axis=-1)
 
@@ -63,14 +63,14 @@ def constant_speeds(loads: LoadSet) -> bool:
 
 
 class ForceWheels(NamedTuple):
-    """What the wheels of all runs share: forces upwards (N), distances behind the first (m)."""
+    """Wheels, the same in all runs: forces upwards (N), distances behind the first wheel (m)."""
 
     force: Float[np.ndarray, " wheel"]
     behind: tuple[Float[np.ndarray, " wheel_of_load"], ...]
 
 
 def force_wheels(case: Case) -> ForceWheels:
-    """Wheels of the loads of a case; once for all runs, as it takes longer than their paths."""
+    """Wheels of the loads of a case; made once for all runs, as this takes longer than paths."""
     behind = tuple(_distances(case, i) for i in range(len(case.loads)))
     return ForceWheels(-np.asarray(load_set(case).weight)[:, 0], behind)
 
@@ -87,9 +87,9 @@ def force_paths(
     addresses: Sequence[str],
     values: Float[np.ndarray, "run address"],
 ) -> ForcePaths:
-    """Paths in runs of a case of constant speeds that differ in the values at some addresses.
+    """Paths of the forces in runs with the `values` at some addresses of a case.
 
-    These are speeds, entry times, start positions and spacings of loads, and the duration.
+    Addresses are speeds, entry times, start positions and spacings of loads, and the duration.
     """
     runs, length = len(values), float(case.beam.length)
     column = dict(zip(addresses, values.T, strict=True))
@@ -120,14 +120,15 @@ def force_paths(
     return ForcePaths(np.concatenate(origins, 1), np.concatenate(speeds, 1), wheels.force, duration)
 
 
-SAME_TIME_SHARE = 1e-12  # of the duration: closer passages are at one time
+SAME_TIME_FRACTION = 1e-12  # of the duration: closer passages are at one time
 
 
 class Panels(NamedTuple):
     """Panels of all runs in the order of time: run, start and length (s), free vibration, forces.
 
-    `amplitude` is that of the poles at the start. Of the `count` forces on the beam in each panel:
-    N upwards, position at t = 0 (m), speed (m/s) with its number, and piece of the beam.
+    `amplitude` is that of the poles at the start of the panel. Each of the `count` forces on the
+    beam has a slot: `force` (N, upwards), `origin` (m), the position at t = 0, `speed` (m/s) with
+    its index `response`, and `piece` of the beam.
     """
 
     run: Int[np.ndarray, " panel"]
@@ -142,7 +143,7 @@ class Panels(NamedTuple):
     piece: Int[np.ndarray, "panel slot"]
 
     def forces_in(self, panel: Int[np.ndarray, " own"]):
-        """Forces in some of the panels: which of these, and indices of panel and slot."""
+        """Forces in some panels: indices of their panels in `panel`, and (panel, slot)."""
         which, slot = np.nonzero(np.arange(self.force.shape[1]) < self.count[panel][:, None])
         return which, (panel[which], slot)
 
@@ -167,7 +168,7 @@ def force_panels(responses: ForceResponses, paths: ForcePaths) -> Panels:
         amplitude[i] = now
         if i < order.shape[1]:
             now = now * decay[:, i] + jumps[:, i]
-    run, kept = np.nonzero(length > SAME_TIME_SHARE * duration[:, None])
+    run, kept = np.nonzero(length > SAME_TIME_FRACTION * duration[:, None])
     start, length = start[run, kept], length[run, kept]
     on_beam = _forces_on_beam(system, paths, run, start + length / 2)
     count, force, piece = on_beam
@@ -177,9 +178,9 @@ def force_panels(responses: ForceResponses, paths: ForcePaths) -> Panels:
 
 
 def _jumps(responses: ForceResponses, paths: ForcePaths, response, passed):
-    """Jumps of the amplitudes (run, wheel, break, pole) where forces pass breaks.
+    """Jumps of the amplitudes of free vibration (run, wheel, break, pole) where forces pass breaks.
 
-    Only nodes change them: there a force leaves one particular solution for another.
+    Only nodes change the amplitudes: there the particular solution of a force changes.
     """
     system = responses.system
     change = np.zeros((responses.speeds.size, system.breaks.size, system.poles.size), complex)
@@ -189,11 +190,11 @@ def _jumps(responses: ForceResponses, paths: ForcePaths, response, passed):
 
 
 def _of_forces_at_start(responses: ForceResponses, paths: ForcePaths, response):
-    """Amplitudes (run, pole) at t = 0, of the forces that are on the beam then."""
+    """Amplitudes of free vibration (run, pole) at t = 0, from forces on the beam at the start."""
     system, nodes = responses.system, responses.system.nodes
     amplitude = np.zeros((paths.duration.size, system.poles.size), complex)
     x, speed = paths.origin, paths.speed
-    # One that enters at t = 0 passes the end then; one that leaves then was inside.
+    # A force that enters at t = 0 passes the end then; a force that leaves then was inside.
     inside = np.where(
         speed > 0, (nodes[0] < x) & (x <= nodes[-1]), (nodes[0] <= x) & (x < nodes[-1])
     )
@@ -207,7 +208,7 @@ def _of_forces_at_start(responses: ForceResponses, paths: ForcePaths, response):
 
 
 def _forces_on_beam(system, paths: ForcePaths, run, middle):
-    """Number of the forces on the beam at the middles of panels; those forces, and their pieces."""
+    """Number, wheels and pieces of the beam of the forces on the beam at the middles of panels."""
     entry, leave = paths.windows(system.nodes[0], system.nodes[-1])
     on_beam = (entry[run] < middle[:, None]) & (middle[:, None] < leave[run])
     count = np.count_nonzero(on_beam, axis=1)
@@ -220,18 +221,19 @@ def _forces_on_beam(system, paths: ForcePaths, run, middle):
     return count, force, piece
 
 
-CHUNK_STEPS = 16  # of a chunk, or FEW_STEPS of one that is no longer than these
-FEW_STEPS = 2
-REFINEMENTS = 4  # of a step,
-MAX_REFINEMENTS = 4  # at most so often,
-ENOUGH_STEPS = 8  # until no more steps than these are left in a run
-MAX_VALUES = 2.5e5  # of forces at instants at once
+CHUNK_STEPS = 16  # steps of a chunk
+FEW_STEPS = 2  # steps of a chunk that is no longer than these
+REFINEMENTS = 4  # parts into which a step is divided
+MAX_REFINEMENTS = 4  # divisions of a step, one after the other
+ENOUGH_STEPS = 8  # steps left in a run at which division ends
+MAX_VALUES = 2.5e5  # values of forces at instants that are computed at once
 
 
 def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) -> Peaks:
-    """Peaks of runs from rest, one to a batch; the fastest pole turns by `phase` (rad) in a step.
+    """Peaks of runs from rest, one run in each batch; the fastest pole turns by `phase` in a step.
 
-    `responses` are those to forces of all speeds of the paths. A run that is not finite has NaN.
+    `responses` include all speeds of the paths, `phase` is in rad. A run that is not finite has
+    NaN.
     """
     panels = force_panels(responses, paths)
     search = _Search(responses, panels, paths.duration.size, phase)
@@ -247,11 +249,11 @@ def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) 
 def search_bytes(
     system: ForceSystem, wheels: int, at_once: int, duration: float, slowest: float, phase: float
 ) -> float:
-    """Memory (bytes) that the search of a run takes at most, beside that of one chunk of values.
+    """Upper bound of the memory (bytes) of the search of a run, without one chunk of values.
 
-    Of `wheels` forces, so many `at_once` on the beam, until the `duration` (s), the slowest at a
-    speed (m/s); steps are of a `phase` (rad). Counted are the arrays of `Panels`, of `_Search` and
-    of `ForceResponses`.
+    The run has `wheels` forces, `at_once` of them on the beam, until the `duration` (s); the
+    slowest moves at `slowest` (m/s), steps have a `phase` (rad). Counted are the arrays of
+    `Panels`, of `_Search` and of `ForceResponses`.
     """
     outputs, poles = system.on_outputs.shape
     segments, terms, _ = system.forces.shape
@@ -265,9 +267,9 @@ def search_bytes(
 
 
 class _Search:
-    """Chunks of a few steps, within panels, with bounds of the outputs in each.
+    """Search for peaks in chunks of a few steps, with bounds of the outputs in each chunk.
 
-    `bound` is one of the output, `bend` one of its second derivative (1/s^2), both (chunk, output).
+    `bound` is a bound of the output, `bend` of its second derivative (1/s^2), (chunk, output).
     """
 
     def __init__(self, responses: ForceResponses, panels: Panels, runs: int, phase: float):
@@ -296,9 +298,9 @@ class _Search:
         self.bend = product(size, largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
         lines, self.cubic_slack = (
             2 * of_forces(error) for error in (responses.table_error, responses.cubic_error)
-        )  # of a value, and of that which is reached
+        )  # errors of a value and of the largest value reached
         self.slack = lines[self.panel]
-        forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
+        forced = np.stack([self._forced(fraction) for fraction in (0.0, 0.5, 1.0)])
         half = (self.length / 2)[:, None]
         self.bound = product(size, largest) + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
         self.bound += self.slack
@@ -307,7 +309,7 @@ class _Search:
         self.first = np.abs(forced[0] + product(self.amplitude, self.C.T).real)
 
     def _place_forces(self):
-        """Where forces are in the tables: index of the point before it at t = 0, and points/s."""
+        """Set the table positions of forces: `place` at t = 0 (points), `rate` (points/s)."""
         panels, responses = self.panels, self.responses
         breaks, count = responses.system.breaks, responses.count
         density = ((count - 1) / np.diff(breaks))[panels.piece]
@@ -317,16 +319,16 @@ class _Search:
         self.offset = panels.response * points + responses.first[panels.piece]
         self.last = count[panels.piece] - 2
 
-    def _forced(self, share: float) -> Float[np.ndarray, "chunk output"]:
-        """All outputs under the forces, at the same share of each chunk, from the tables."""
+    def _forced(self, fraction: float) -> Float[np.ndarray, "chunk output"]:
+        """All outputs due to the forces at a fraction of each chunk, from the tables."""
         table = self.responses.table.reshape(-1, self.C.shape[0])
-        times = (self.start + share * self.length)[:, None]
+        times = (self.start + fraction * self.length)[:, None]
         return self._from_table(table, self.panel, times)[:, 0]
 
     def _from_table(self, table, panel, times, cubic: bool = False):
-        """Values of a table under the forces in panels, at times (panel, time).
+        """Sums of the table values of the forces in panels, at times (panel, time).
 
-        On lines between its points, or on cubics.
+        The table is interpolated linearly, or by cubics.
         """
         width = times.shape[1] * (table.size // table.shape[0])
         if self._too_many(panel, width):
@@ -336,20 +338,20 @@ class _Search:
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
         last = self.last[at][:, None]
         low = np.clip(place.astype(int), int(cubic), last - int(cubic))
-        share = np.clip(place, 0.0, last + 1) - low
+        fraction = np.clip(place, 0.0, last + 1) - low
         low += self.offset[at][:, None]
         if cubic:
-            r = sum(w * table[low + i] for i, w in enumerate(_cubic_weights(share), start=-1))
+            r = sum(w * table[low + i] for i, w in enumerate(_cubic_weights(fraction), start=-1))
             return _sums(self.panels.force[at][:, None] * r, which, panel.size)
         force = self.panels.force[at].reshape(-1, *(1,) * table.ndim)
-        share = share.reshape(*share.shape, *(1,) * (table.ndim - 1))
+        fraction = fraction.reshape(*fraction.shape, *(1,) * (table.ndim - 1))
         below = table[low]
-        below += share * (table[low + 1] - below)
+        below += fraction * (table[low + 1] - below)
         below *= force
         return _sums(below, which, panel.size)
 
     def _too_many(self, panel, width: int) -> bool:
-        """Whether arrays with so many numbers for each force in panels are too large."""
+        """Whether arrays with `width` numbers for each force in panels are too large."""
         return panel.size > 1 and int(self.panels.count[panel].sum()) * width > MAX_VALUES
 
     def peaks(self) -> tuple[Float[np.ndarray, "run output"], Float[np.ndarray, "run output"]]:
@@ -359,9 +361,9 @@ class _Search:
         return self._refined(output, *(np.concatenate(part) for part in zip(*steps, strict=True)))
 
     def _steps_of_peak(self, output: int):
-        """Short steps in one of which each run has the peak of an output.
+        """Panels, starts, lengths (s) and initial amplitudes of short steps that may have a peak.
 
-        Their panels, starts and lengths (s), and the amplitudes at the start.
+        Each run has the peak of the output in one of these steps.
         """
         reached, bound = np.zeros(self.runs), self.bound[:, output]
         _raise_to(reached, self.run, self.first[:, output])
@@ -377,7 +379,7 @@ class _Search:
         steps = [part[order] for part in steps]
         for _ in range(MAX_REFINEMENTS):
             steps[-1] = self.cubic_slack[steps[0], output]
-            reached = np.zeros(self.runs)  # what lines reach may be too high
+            reached = np.zeros(self.runs)  # values of linear interpolation may be too high
             steps = list(self._parts_of_steps(output, REFINEMENTS, reached, *steps, cubic=True))
             if steps[0].size <= ENOUGH_STEPS * self.runs:
                 break
@@ -386,9 +388,9 @@ class _Search:
     def _parts_of_steps(
         self, output, parts, reached, panel, start, length, amplitude, bend, slack, cubic=False
     ):
-        """Parts of steps in which an output may be above what is reached, which is raised.
+        """Panel, start, length, amplitude and bounds of parts of steps that may have the peak.
 
-        Panel, start, length, amplitude, and bounds of each.
+        An output may exceed the largest value `reached` in its run there; `reached` is updated.
         """
         step = length / parts
         times = start[:, None] + step[:, None] * np.arange(parts + 1)
@@ -403,10 +405,7 @@ class _Search:
         return *parts_of, bend[which], slack[which]
 
     def _values(self, output: int, panel, amplitude, step, times, cubic: bool):
-        """Magnitudes of an output at equally spaced times, and growth of free vibration in a step.
-
-        From one time to the next by the growth.
-        """
+        """Magnitudes of an output at equally spaced times; growth of free vibration in a step."""
         values = self._from_table(self.tables[output], panel, times, cubic)
         growth = np.exp(step[:, None] * self.poles)
         now = amplitude * self.C[output]
@@ -416,7 +415,7 @@ class _Search:
         return np.abs(values), growth
 
     def _refined(self, output, panel, start, length, amplitude):
-        """Peaks, and times (s), by the polynomials through exact values at nodes of short steps."""
+        """Peaks and times (s) from polynomials through exact values at the nodes of short steps."""
         since = np.array(PEAK_NODES) * length[:, None]
         growth = np.exp(since[..., None] * self.poles)
         free = growth @ (amplitude * self.C[output])[..., None]
@@ -435,7 +434,7 @@ class _Search:
         return value, time
 
     def _exact(self, output, panel, times):
-        """Exact values of outputs under the forces in panels at times (panel, time)."""
+        """Exact values of outputs due to the forces in panels at times (panel, time)."""
         if self._too_many(panel, times.shape[1] * self.responses.solutions.shape[2]):
             parts = _halves(output, panel, times)
             return np.concatenate([self._exact(*one) for one in parts])
@@ -456,7 +455,7 @@ def _halves(*arrays):
 
 
 def _cubic_weights(s):
-    """Weights of values at -1, 0, 1 and 2 in the cubic through them, at s."""
+    """Weights of the values at -1, 0, 1 and 2 in their interpolating cubic at s."""
     return (
         -s * (s - 1) * (s - 2) / 6,
         (s + 1) * (s - 1) * (s - 2) / 2,
@@ -466,7 +465,7 @@ def _cubic_weights(s):
 
 
 def _sums(values, which, count: int):
-    """Sums (count, ...) of consecutive values, of which each belongs to one."""
+    """Sums (count, ...) of consecutive values; `which` is the index of the sum of each value."""
     result = np.zeros((count, *values.shape[1:]))
     first = np.flatnonzero(np.diff(which, prepend=-1))
     if first.size:
@@ -475,7 +474,7 @@ def _sums(values, which, count: int):
 
 
 def _raise_to(reached, run, values) -> None:
-    """Raise what is reached in each run to the largest of its values; runs are in order."""
+    """Raise `reached` of each run to the largest of its values, in place; runs are in order."""
     first = np.flatnonzero(np.diff(run, prepend=-1))
     if first.size:
         own = run[first]

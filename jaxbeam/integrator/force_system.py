@@ -6,7 +6,7 @@ acts by
     eta' = lambda eta + b(x) F,    b(x) = V^-1 B psi(x),
 
 so that eta = F p(x) + a exp(lambda t), where v p' - lambda p = b(x): a polynomial between the nodes
-of the mode shapes, as b is. All forces of one speed share p. The amplitudes a of the free vibration
+of the mode shapes, as b is. All forces of one speed have one p. The amplitudes a of free vibration
 change where a force enters, passes a node or leaves, so that eta is continuous. Outputs then are
 
     y = sum over the forces of F r(x) + Re(C a exp(lambda t)),    r(x) = Re(C p(x)) + influence(x),
@@ -32,11 +32,11 @@ def product(left, right) -> np.ndarray:
 
 
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
-TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them
+TABLE_POINTS = 600  # least number of points on the beam, between which tables are linear
 POINTS_PER_MODE = 40
 TABLE_PHASE = 0.3  # rad of the fastest pole, at most, between two points under the slowest force
-SHORTEST = 1e-12  # of the length: shorter segments are left out
-CURVATURE_MARGIN = 1.2  # of the curvature over second differences of the table
+SHORTEST = 1e-12  # fraction of the length; shorter segments are left out
+CURVATURE_MARGIN = 1.2  # bound of the curvature over second differences of the table
 
 
 class ForceSystem(NamedTuple):
@@ -60,7 +60,7 @@ class ForceSystem(NamedTuple):
 
     @property
     def segment(self) -> Int[np.ndarray, " piece"]:
-        """Segment in which each piece between two breaks is."""
+        """Index of the segment that contains each piece between two breaks."""
         middle = (self.breaks[:-1] + self.breaks[1:]) / 2
         return np.searchsorted(self.nodes[1:-1], middle)
 
@@ -74,7 +74,7 @@ class ForceSystem(NamedTuple):
     def static_part(self, x, piece, output=None) -> Float[np.ndarray, "force ..."]:
         """Static part of r (force, output) at positions (m) in pieces.
 
-        Only of one `output` at each, if it is given.
+        With `output` it is that of one output at each position, (force,).
         """
         if self.static.influence is None:
             return np.zeros((x.size, self.on_outputs.shape[0]))
@@ -107,7 +107,7 @@ def force_system(
     if outputs.influence is not None:
         outputs = dataclasses.replace(outputs, influence=outputs.influence.on_line(eccentricity))
     nodes, series = np.asarray(model.load_nodes), series @ into.T
-    if model.spread is not None:  # shares of an axle may pass nodes at one time
+    if model.spread is not None:  # parts of a spread axle force may pass nodes at one time
         long = np.diff(nodes) > SHORTEST * (nodes[-1] - nodes[0])
         nodes, series = np.append(nodes[:-1][long], nodes[-1]), series[long]
     places = np.clip(model.load_places(places), nodes[0], nodes[-1])
@@ -125,8 +125,8 @@ def particular_solutions(
 ) -> Complex[np.ndarray, "speed segment n pole"]:
     """Chebyshev series of p(x), with v p' - lambda p = b(x), in each segment at speeds v (m/s).
 
-    By the recurrence 2 n p_n = c_(n-1) p'_(n-1) - p'_(n+1) of the coefficients of a derivative. Of
-    a pole that turns far within a segment the polynomial of the degree of b; of others, the
+    Coefficients follow the recurrence 2 n p_n = c_(n-1) p'_(n-1) - p'_(n+1) of derivatives. For a
+    pole that turns far within a segment p is the polynomial of the degree of b, for others the
     solution that vanishes at the left node.
     """
     segments, terms, poles = system.forces.shape
@@ -143,8 +143,8 @@ def particular_solutions(
         far = np.abs(system.poles / rates) >= terms
         p = np.zeros((size, speeds.size, poles), complex)
         for k in range(terms, 0, -1):  # from the highest coefficient down
-            known = 2 * k * rates * p[k] + system.poles * p[k + 1] - right[s, k]
-            p[k - 1] = np.where(far, known / (system.poles * c[k - 1]), 0.0)
+            higher = 2 * k * rates * p[k] + system.poles * p[k + 1] - right[s, k]
+            p[k - 1] = np.where(far, higher / (system.poles * c[k - 1]), 0.0)
         result[:, s] = np.moveaxis(p, 0, 1)
         at_speed, near = np.nonzero(~far)
         if near.size:
@@ -182,7 +182,7 @@ class ForceResponses(NamedTuple):
     count: Int[np.ndarray, " piece"]
 
     def exact(self, speed, piece, x, output) -> Float[np.ndarray, " force"]:
-        """r(x) of an output, for forces of numbered speeds at x (m) in pieces of the beam."""
+        """r(x) of an output for forces at x (m); `speed` and `piece` are indices of each force."""
         segment = self.system.segment[piece]
         series = self.on_outputs[speed, segment, :, output].T
         t = _local(self.system.nodes, segment, x)
@@ -203,7 +203,7 @@ class ForceResponses(NamedTuple):
 
 
 def _local(nodes, segment, x):
-    """Positions within segments, -1 to 1."""
+    """Local coordinates (-1 to 1) in their segments of positions x (m)."""
     return np.clip(2 * (x - nodes[segment]) / (nodes[segment + 1] - nodes[segment]) - 1, -1, 1)
 
 
@@ -225,7 +225,7 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
     table += system.static_part(points, piece)
     bends, fourth = (_largest_differences(table, first, order) for order in (2, 4))
     error = CURVATURE_MARGIN / 8 * bends
-    # At the ends of a piece a cubic holds in the outer interval, where its error is the largest.
+    # At the ends of a piece the cubic is used in an outer interval, where its error is largest.
     cubic_error = CURVATURE_MARGIN / 24 * fourth
     distance = (np.diff(system.breaks) / (count - 1))[:, None]
     curvature = CURVATURE_MARGIN * speeds[:, None, None] ** 2 * bends / distance**2
@@ -234,7 +234,7 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
 
 
 def _largest_differences(table, first, order: int):
-    """Largest magnitudes of the differences (speed, piece, output) of an order in each piece."""
+    """Largest magnitude (speed, piece, output) of the differences of an order in each piece."""
     differences = np.abs(np.diff(table, order, axis=1, append=np.zeros_like(table[:, :order])))
     last = np.append(first[1:], table.shape[1]) - order
     bounds = np.stack([first, last], axis=1).reshape(-1)
@@ -242,7 +242,7 @@ def _largest_differences(table, first, order: int):
 
 
 def table_points(system: ForceSystem, slowest: float) -> float:
-    """Number of points of tables, at least, for forces of which the slowest has a speed (m/s).
+    """Least number of points of a table, for forces of at least the `slowest` speed (m/s).
 
     Poles that turn further than `terms` in half a segment have polynomials as particular solutions.
     """

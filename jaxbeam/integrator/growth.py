@@ -1,10 +1,10 @@
-"""Divergence of closed loops, told by the growth of the motion and not by its size.
+"""Divergence of closed loops, detected from the growth of the motion and not from its size.
 
 A loop that is unstable grows exponentially, a bounded motion at most as a power of time while it
 starts. So the largest amplitude of the modes is compared at the end of the run, at half, a quarter,
 an eighth of it, and so on: the run diverges if it has grown by more than GROWTH from one of these
 times to the next, and once more to the one after that. Neither unit nor size matters. Amplitudes
-below that of the loads, as if all stood on the beam, count as this: loads that enter late.
+below the static one of all loads at once are raised to it, as loads may enter late.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ from jaxbeam.runtime.arrays import Array, any_jax, stop_gradient, xp
 
 GROWTH = 100.0  # a motion that starts from rest as the sixth power of time grows 64-fold
 MARK_COUNT = 12  # times at which amplitudes are compared
-OVERFLOW = 1e100  # states beyond it are NaN, as their squares overflow soon; of any unit
-ELASTIC = 1e-9  # of the unit of stiffness: less is motion as a rigid body
+OVERFLOW = 1e100  # larger states become NaN, as their squares would overflow soon; in any unit
+ELASTIC = 1e-9  # relative to the unit of stiffness; less is rigid-body motion
 
 
 def load_amplitude(case, model: ModalModel, loads: LoadSet) -> Float[Array, " batch"]:
@@ -39,7 +39,7 @@ def _times_of(case):
 
 
 def has_feedback(policy) -> bool:
-    """Whether commands may depend on the state, as far as is known."""
+    """Whether commands may depend on the state; True where a traced amplitude leaves it open."""
     return any_jax(policy.load_amplitude) or bool(np.any(np.isfinite(policy.load_amplitude)))
 
 
@@ -51,7 +51,7 @@ def growth_marks(grid: TimeGrid) -> Float[Array, " mark"]:
 def amplitudes(
     model: ModalModel, states: Float[Array, "time state batch"]
 ) -> Float[Array, "time batch"]:
-    """Roots of q'^2 + k q^2, summed over the modes; infinite where a state is none."""
+    """Root of the sum of q'^2 + k q^2 over the modes, (time, batch); infinite where it is NaN."""
     stiffness = xp.diagonal(model.stiffness())[:, None]
     q, rates = states[:, model.coordinate_index], states[:, model.rate_index]
     root = xp.sqrt(xp.sum(rates**2 + xp.abs(stiffness) * q**2, axis=1))

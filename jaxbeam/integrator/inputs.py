@@ -1,4 +1,4 @@
-"""Commands to the actuators, as the integrator asks for them: policies, and known commands."""
+"""Input policies: commands to the actuators during a run, computed or given beforehand."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple
@@ -28,8 +28,8 @@ class AbstractInputPolicy(Module):
 
     With `implicit`, commands depend on the states at the Gauss nodes of the step. With
     `holds_commands`, commands and memory change only at events of the schedule. `load_amplitude`
-    is the least amplitude from which growth is divergence (see `growth`), infinite for commands
-    that do not depend on the state.
+    is the least amplitude at which growth counts as divergence (see `growth`), infinite for
+    commands that do not depend on the state.
     """
 
     holds_commands: ClassVar[bool] = False
@@ -56,9 +56,9 @@ class AbstractInputPolicy(Module):
 
 
 class HeldCommands(AbstractInputPolicy):
-    """Input policy of commands that begin at the events of a schedule, as those of an earlier run.
+    """Input policy of given commands, held between events, as the commands of an earlier run.
 
-    At the nodes of a step each command is the same: (node and actuator) of a row.
+    A row of `commands` has them at each node of a step and actuator; all nodes have the same.
     """
 
     model: ModalModel

@@ -69,7 +69,7 @@ from jaxbeam.runtime.arrays import (
 )
 from jaxbeam.runtime.compiling import compiled
 
-BLOCK_STEPS = 64  # of a law in continuous time, which a program advances together
+BLOCK_STEPS = 64  # steps of a law in continuous time that a program advances together
 # Largest phase (rad) of the highest mode in a step. Beyond twice the number of nodes, the contact
 # force of a mass, a polynomial in each step, cannot follow that mode's oscillation and excites it.
 MAX_PHASE_PER_STEP = 1.9 * NODE_COUNT
@@ -81,11 +81,11 @@ MAX_PASSAGE_PER_STEP = 0.64
 def advance_with_inputs(policy, vehicles: Vehicles | None, steps: StepInput, infos, state, memory):
     """Steps under commands: (state, memory) after them, and (states, forces, commands, observed).
 
-    These are at the starts of the steps; forces and commands at their nodes.
+    States and observations are at the starts of the steps, forces and commands at their nodes.
     """
     maps = step_maps(steps, vehicles)
-    known = not policy.implicit and not any_jax(maps, state, memory, policy)
-    found = _advance_known(policy, maps.states, infos, state, memory) if known else None
+    concrete = not policy.implicit and not any_jax(maps, state, memory, policy)
+    found = _advance_concrete(policy, maps.states, infos, state, memory) if concrete else None
     if found is None:
         found = _advance_traced(policy, maps, infos, state, memory)
     after, sources, observed = found
@@ -98,11 +98,11 @@ def advance_with_inputs(policy, vehicles: Vehicles | None, steps: StepInput, inf
 def _advance_traced(policy, maps, infos, state, memory):
     """Final state and memory; states and commands (step, batch, column); observations."""
     steps = (maps.states, maps.nodes), infos
-    start = jax.tree.map(jnp.asarray, (state, memory))  # even if all numbers are known
+    start = jax.tree.map(jnp.asarray, (state, memory))  # even if all numbers are concrete
     if not policy.implicit or any_traced(steps, start, policy):
         after, (sources, observed) = _scan_steps(policy, steps, start)
         return after, sources, observed
-    # Blocks of equal length share one program; the last is filled up by repetitions of its step.
+    # Blocks of equal length use one program; the last is filled up by repetitions of its step.
     count, found, carry = len(infos.start), [], start
     index = np.minimum(np.arange(-(-count // BLOCK_STEPS) * BLOCK_STEPS), count - 1)
     for block in index.reshape(-1, BLOCK_STEPS):
@@ -141,10 +141,10 @@ def _scan_steps(policy, steps, start):
 _scan_block = compiled(_scan_steps)
 
 
-def _advance_known(policy, of_states, infos, state, memory):
-    """The same of known numbers, under commands that do not depend on the states within a step.
+def _advance_concrete(policy, of_states, infos, state, memory):
+    """`_advance_traced` in NumPy, for commands that do not depend on the states within a step.
 
-    None if the policy computes with JAX in spite of known numbers, as a law of a user may.
+    None if the policy computes with JAX from concrete numbers, as a law of a user may.
     """
     count, batch_size, state_count = of_states.offset.shape
     # State and commands.
@@ -184,8 +184,9 @@ def max_stable_step(model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
 def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
     """Longest step (s) that resolves the passage of forces over the highest mode shape.
 
-    Their generalised forces are known functions of time, so no error but that of their polynomials
-    arises. Infinite for loads with inertia or springs, whose steps an error estimate decides.
+    Generalised forces of such loads are given functions of time, so that the only error is that of
+    their polynomials. Infinite for loads with inertia or springs, whose steps an error estimate
+    decides.
     """
     if not loads.massless or not loads.trajectories:
         return xp.asarray(np.inf)
@@ -200,7 +201,7 @@ def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
 def _of_wheels(
     values: Float[Array, "wheel batch"], path: LoadPath
 ) -> Float[Array, "step load 1 batch"]:
-    """A property of the wheels in the rows of a path; zero off the beam."""
+    """Values (of each wheel) arranged by the wheels of the steps of a path; zero off the beam."""
     selected = xp.where(path.on_beam[..., None], take(values, path.loads), 0.0)
     return selected[:, :, None]
 
@@ -217,7 +218,7 @@ def _weights(loads: LoadSet, path: LoadPath, fractions) -> Float[Array, "step lo
 
 
 def step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
-    """Matrices and wheels of the steps of a chunk."""
+    """Matrices, inertia (kg) and weight (N) of the wheels in the steps of a chunk."""
     weight = collapse(_weights(loads, path, GAUSS_NODES), 1, 3)
     inertia = xp.repeat(_of_wheels(loads.inertia, path)[:, :, 0], NODE_COUNT, axis=1)
     if path.surface is not None:
@@ -240,11 +241,11 @@ def _chunk_function(
     policy: AbstractInputPolicy | None,
     steps: int | None = None,
 ):
-    """Function that advances state, memory and running peaks by a chunk of steps; their number.
+    """Function that advances state, memory and running peaks by a chunk, and steps of a chunk.
 
-    It also returns the time (s) at the end of the chunk, and the histories (states before each
-    step, commands at the nodes, observations). Of a run of so many `steps` whose path and model are
-    known all are one chunk, whose matrices are known then, too.
+    The function also returns the time (s) at the end of the chunk, and the histories (states before
+    each step, commands at the nodes, observations). A traced run of `steps` is a single chunk, if
+    memory allows it.
     """
 
     chunk_steps = chunk_length(
@@ -304,10 +305,10 @@ def peaks_of_halves(
     states: Float[np.ndarray, "boundary state batch"],
     commands: Float[np.ndarray, "step command batch"] | None,
 ) -> RunningPeaks:
-    """Peaks of a known run in the steps that hold them, each of which is taken as two halves.
+    """Peaks of a run computed again with halved steps, only in the steps that have the peaks.
 
-    A step begins with its state in the run, and has its commands. The discrete model is made
-    `on_grid`, for the lengths of these halves only.
+    Each step begins with its state in the run, and has its commands. The function `on_grid` gives
+    the discrete model, for the lengths of these halves only.
     """
     _, starts, _ = grid.locate_steps(np.arange(int(grid.step_count)))
     index = np.unique(np.searchsorted(starts, running_peaks.step_start, side="right") - 1)
@@ -364,9 +365,8 @@ def integrate_history(
     States (boundary, state, batch) are those before each step and at the end. Commands (step,
     command, batch) at the nodes, observations of each step, and the final memory of the `policy`
     are None without one. Running peaks are those at the monitored positions, None without any.
-    `max_loads` is the largest number of loads on the beam at once. Of a run whose matrices
-    do not fit into memory, or that is to be integrated `in_chunks`, the reverse pass saves one
-    state for each chunk.
+    `max_loads` is the largest number of loads on the beam at once. The reverse pass saves one state
+    for each chunk, if the matrices of the run do not fit into memory, or with `in_chunks`.
     """
     at_once = None if in_chunks else steps
     chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, at_once)

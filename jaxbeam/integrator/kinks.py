@@ -23,7 +23,7 @@ from jaxbeam.runtime.module import Module
 
 
 class KinkSteps(Module):
-    """Which steps are passages over kinks, and the jumps of velocity under the wheels there.
+    """Kink passages among steps (`here`), and the jumps of velocity under the wheels in them.
 
     `slopes` are rows from q to |v| [w'], `profile` is |v| [r'] (m/s); zero for other wheels.
     """
@@ -37,7 +37,7 @@ class KinkPassages(Module):
     """Passages of wheels over kinks: times (s; `NEVER` if there is none), indices of the wheels.
 
     `slope_jumps` are rows from the coordinates q to the jump [w'] of the slope of the beam,
-    `profile_jumps` those of the slope of the profile (1), from left to right.
+    `profile_jumps` the jumps of the slope of the profile (1), from left to right.
     """
 
     times: Float[Array, " passage"]
@@ -52,7 +52,10 @@ class KinkPassages(Module):
         on_beam: Bool[Array, "step load"],
         speed: Float[Array, "step load"],
     ) -> "KinkSteps":
-        """Steps of which some are passages of an index, -1 for none; of given wheels and speeds."""
+        """Kink passages and velocity jumps of steps, from the index of the passage (-1 for none).
+
+        `loads` are the indices of the wheels in each step, `speed` (m/s) is at its start.
+        """
         here, which = passage >= 0, xp.maximum(passage, 0)
         passing = here[:, None] & on_beam & (loads == take(self.wheels, which)[:, None])
         speed = xp.where(passing, xp.abs(speed), 0.0)
@@ -62,7 +65,7 @@ class KinkPassages(Module):
     def happen(
         self, windows: Float[Array, "wheel 2"], start: Float[Array, ""], end: Float[Array, ""]
     ) -> Bool[Array, " passage"]:
-        """Whether each happens between two times (s), with the wheel on the beam before and after.
+        """Whether each passage is between two times (s), with the wheel on the beam on both sides.
 
         `windows` are the times of entry and exit of all wheels.
         """
@@ -73,12 +76,12 @@ class KinkPassages(Module):
 def kink_passages(
     case: Case, model: ModalModel, loads: LoadSet | None = None
 ) -> KinkPassages | None:
-    """Passages of the wheels of a case that may have mass over all kinks; None without any.
+    """Passages over all kinks of the wheels that may have mass; None without kinks or such wheels.
 
-    `loads` are those of the case, if they are known.
+    `loads` are those of the case, computed unless they are given.
     """
     nodes = np.array(kink_nodes(case, model.modes.layout), int)
-    if model.modes.rail_series is not None:  # which has none
+    if model.modes.rail_series is not None:  # a rail has no kinks
         nodes = nodes[:0]
     if not (nodes.size or case.profile is not None or has_settlement(case)):
         return None
@@ -116,5 +119,5 @@ def may_have_kinks(case: Case) -> bool:
 def _has_mass(load: AbstractLoad) -> Bool[np.ndarray, " wheel"]:
     """Whether each wheel of a load may have mass that is rigidly on the surface."""
     masses = load.vehicle(np.ones(())).wheel_masses
-    known = np.asarray(concrete(masses)) if is_concrete(masses) else np.ones(masses.shape)
-    return np.tile(known != 0, load.spacings().shape[0])
+    values = np.asarray(concrete(masses)) if is_concrete(masses) else np.ones(masses.shape)
+    return np.tile(values != 0, load.spacings().shape[0])

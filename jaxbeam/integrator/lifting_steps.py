@@ -45,11 +45,12 @@ NEWTON_TOLERANCE = 1e-13
 class ContactLaw(NamedTuple):
     """Numbers of all wheels, and the linear system of heights and vehicles; see the module.
 
-    `rigid` wheels have mass and no spring of contact, `sprung` ones both, `tyre` ones stand on a
-    spring of the vehicle; others are given forces. Those of absorbers are `held` on the beam. A
-    `spring` of contact has a factor and a power, `compressed` is d_0 (m). `height` and `force` map
-    e to h and s, `direct` is the compliance 1 / k of a tyre without damper, whose h is no state.
-    `height_index` and `rate_index` are those of h and h' in e, -1 for none; `scale` is that of e.
+    `rigid` wheels have mass and no spring of contact, `sprung` wheels have both, `tyre` wheels
+    stand on a spring of the vehicle; others are given forces. Wheels of absorbers are `held` on the
+    beam. A `spring` of contact has a factor and a power, `compressed` is d_0 (m). `height` and
+    `force` map e to h and s, `direct` is the compliance 1 / k of a tyre without damper, whose h is
+    no state. `height_index` and `rate_index` are the indices of h and h' in e, -1 for none; `scale`
+    are the factors that scale e.
     """
 
     mass: Float[np.ndarray, " wheel"]
@@ -72,7 +73,7 @@ class ContactLaw(NamedTuple):
 
     @property
     def contact(self) -> Bool[np.ndarray, " wheel"]:
-        """Whether each wheel is no given force."""
+        """Whether each wheel has a contact law; the others are given forces."""
         return self.rigid | self.sprung | self.tyre
 
     def norm(self) -> float:
@@ -84,14 +85,14 @@ class ContactLaw(NamedTuple):
         return float(np.max(np.sum(matrix, axis=1), initial=frequency))
 
     def of_compression(self, compression):
-        """Force (N) of a spring of contact, and its derivative (N/m)."""
+        """Force (N) of a contact spring at a compression (m), and its derivative (N/m)."""
         factor, power = self.spring
         pressed = np.maximum(compression, 0.0)
         return factor * pressed**power, factor * power * pressed ** (power - 1)
 
 
 def contact_law(loads: LoadSet, spring: tuple[float, float] | None) -> ContactLaw:
-    """Contact law of loads, of one run; `spring` of contact is None for rigid wheels."""
+    """Contact law of the loads of one run; the contact `spring` is None for rigid wheels."""
     mass, weight = (np.asarray(part)[:, 0] for part in (loads.inertia, loads.weight))
     none = np.zeros((mass.size, 1))
     springs = loads.wheels.stiffness, loads.wheels.damping
@@ -143,8 +144,11 @@ def contact_law(loads: LoadSet, spring: tuple[float, float] | None) -> ContactLa
 
 
 class Instants(NamedTuple):
-    """What the law needs at instants: rows from the states of the beam to y, y' and y'', the
-    profile's share of these, mode shapes, static loads P (N), and which wheels are on the beam.
+    """Inputs of the contact law at instants.
+
+    `rows` map states of the beam to y, y' and y'' under the wheels, to which the `profile` adds its
+    height, velocity and acceleration. `shape` are mode shapes at the wheels, `weight` the static
+    loads P (N).
     """
 
     rows: Float[np.ndarray, "*time 3 wheel state"]
@@ -167,29 +171,29 @@ class Instants(NamedTuple):
         states: Float[np.ndarray, "*time state"],
         e: Float[np.ndarray, "*time e"],
     ) -> Float[np.ndarray, "*time wheel"]:
-        """Contact forces (N) of wheels, of which some press, by their laws."""
+        """Contact forces (N) of all wheels by their laws; zero for wheels in flight."""
         y, rate, acceleration = np.moveaxis(self.motion(states), -2, 0)
         s = e @ law.force.T
-        known = np.where(law.contact, 0.0, self.weight * self.on_beam)
+        force = np.where(law.contact, 0.0, self.weight * self.on_beam)
         on_tyre = self.weight + law.stiffness * y + law.damping * rate + s
-        known = np.where(law.tyre & pressing, on_tyre, known)
+        force = np.where(law.tyre & pressing, on_tyre, force)
         on_spring = law.of_compression(law.compressed + y - e @ law.height.T)[0]
-        known = np.where(law.sprung & pressing, on_spring, known)
+        force = np.where(law.sprung & pressing, on_spring, force)
         rigid = law.rigid & pressing
         if not rigid.any():
-            return known
+            return force
         # Forces on the beam change the acceleration under rigid wheels at once.
         coupling = self.shape @ np.swapaxes(self.shape, -1, -2)
         mass = np.where(rigid, law.mass, 0.0)
-        by_known = (coupling @ known[..., None])[..., 0]
-        right = np.where(rigid, self.weight + s + mass * (acceleration - by_known), 0.0)
+        by_others = (coupling @ force[..., None])[..., 0]
+        right = np.where(rigid, self.weight + s + mass * (acceleration - by_others), 0.0)
         matrix = np.eye(mass.shape[-1]) + mass[..., None] * coupling * rigid[..., None, :]
         found = np.asarray(solve_at_instants(matrix[..., None], right[..., None]))[..., 0]
-        return np.where(rigid, found, known)
+        return np.where(rigid, found, force)
 
 
 def instants(model: ModalModel, loads: LoadSet, times, on_beam) -> Instants:
-    """What the law needs at times (s) of any shape, with the wheels that are on the beam."""
+    """Inputs of the contact law at times (s) of any shape; `on_beam` (*time, wheel)."""
     position, speed, acceleration = (
         np.moveaxis(np.asarray(part), 0, -1) for part in loads.kinematics(times)
     )
@@ -207,13 +211,14 @@ def instants(model: ModalModel, loads: LoadSet, times, on_beam) -> Instants:
 
 
 class Steps(NamedTuple):
-    """Steps that are prepared together, without load events inside.
+    """Matrices of steps without load events inside, prepared together.
 
-    `at` are their points. `transition` maps the state at the start to those at the points, `forced`
-    contact forces (wheel and node) at once; so do `of_e` and `by_excess` for e, with F - P, and
-    `at_rest` is what -P leaves of e. `law_rows`, `law_known` and `compliance` are the contact law
-    at the nodes: F, or for springs of contact the compression, is known + rows (states, then e) +
-    compliance F, of free states and e.
+    `at` are the inputs of the contact law at the points of the steps. States at the points are
+    `transition` times the state at the start plus `forced` times the contact forces (wheel, node);
+    e at the points is `of_e` times e at the start plus `by_excess` times F plus `at_rest`, the
+    response to -P. The contact law at the nodes is F (or the compression of a contact spring) =
+    `law_constant` + `law_rows` states + `law_e` e + `compliance` F, with the states and e of free
+    vibration.
     """
 
     start: Float[np.ndarray, " step"]
@@ -227,12 +232,12 @@ class Steps(NamedTuple):
     at_rest: Float[np.ndarray, "step point e"]
     law_rows: Float[np.ndarray, "step node wheel state"]
     law_e: Float[np.ndarray, "wheel e"]
-    law_known: Float[np.ndarray, "step wheel node"]
+    law_constant: Float[np.ndarray, "step wheel node"]
     compliance: Float[np.ndarray, "step wheel node wheel node"]
 
 
 def prepare(model: ModalModel, loads: LoadSet, law: ContactLaw, start, length, on_beam) -> Steps:
-    """Steps of given starts and lengths (s), with the wheels (step, wheel) that are on the beam."""
+    """Matrices of steps with given starts and lengths (s) and wheels on the beam (step, wheel)."""
     times = start[:, None] + length[:, None] * INSIDE
     steps, count = on_beam.shape
     active = np.broadcast_to(on_beam[:, None], (steps, POINTS.size, count))
@@ -262,8 +267,8 @@ def prepare(model: ModalModel, loads: LoadSet, law: ContactLaw, start, length, o
     at_rest = np.stack(
         [-np.einsum("pewf,wf->pe", by_excess[i], one) for i, one in zip(index, weight, strict=True)]
     )
-    law_rows, law_known = _law_at_nodes(law, at)
-    law_known = law_known + np.where(law.sprung[:, None], 0.0, weight)
+    law_rows, law_constant = _law_at_nodes(law, at)
+    law_constant = law_constant + np.where(law.sprung[:, None], 0.0, weight)
     law_e = np.where(law.sprung[:, None], -law.height, law.force)
     compliance = law_rows @ forced[:, NODES]  # step, node, wheel, (wheel, node)
     compliance = np.moveaxis(compliance.reshape(steps, NODE_COUNT, count, count, NODE_COUNT), 1, 2)
@@ -276,12 +281,12 @@ def prepare(model: ModalModel, loads: LoadSet, law: ContactLaw, start, length, o
         start, length, index, at, transition,
         forced.reshape(steps, -1, count * NODE_COUNT), of_e,
         by_excess.reshape(lengths.size, -1, count * NODE_COUNT), at_rest,
-        law_rows, law_e, law_known, compliance - at_once,
+        law_rows, law_e, law_constant, compliance - at_once,
     )  # fmt: skip
 
 
 def _law_at_nodes(law: ContactLaw, at: Instants):
-    """Rows (step, node, wheel, state) and known part (step, wheel, node) of the contact law."""
+    """Rows (step, node, wheel, state) and constant (step, wheel, node) of the contact law."""
     rows, profile = np.moveaxis(at.rows[:, NODES], 2, 0), np.moveaxis(at.profile[:, NODES], 2, 0)
     of_motion = np.stack(
         [
@@ -291,12 +296,12 @@ def _law_at_nodes(law: ContactLaw, at: Instants):
         ]
     )
     law_rows = np.einsum("jw,jtcwn->tcwn", of_motion, rows)
-    known = np.einsum("jw,jtcw->twc", of_motion, profile)
-    return law_rows, known + np.where(law.sprung, law.compressed, 0.0)[:, None]
+    constant = np.einsum("jw,jtcw->twc", of_motion, profile)
+    return law_rows, constant + np.where(law.sprung, law.compressed, 0.0)[:, None]
 
 
 def _of_heights(law: ContactLaw, lengths: Float[np.ndarray, " length"]):
-    """Maps of e (length, point, e, e), and of F - P (length, point, e, wheel, node) to e."""
+    """Maps to e at the points: of e at the start, and of F - P (length, point, e, wheel, node)."""
     size, count = law.B.shape
     if not size:
         none = np.zeros((lengths.size, POINTS.size, 0, 0))
@@ -315,7 +320,7 @@ def _of_heights(law: ContactLaw, lengths: Float[np.ndarray, " length"]):
 
 
 class Piece(NamedTuple):
-    """A step without events inside: which wheels press, forces (N), and what is at its points."""
+    """A step without events inside: wheels that press, forces (N), states, e and gaps (m)."""
 
     start: float
     length: float
@@ -328,7 +333,7 @@ class Piece(NamedTuple):
 
 
 def advance(law: ContactLaw, steps: Steps, i: int, pressing, state, e) -> Piece:
-    """One of the steps from a state of the beam and of heights, with wheels that press in it."""
+    """Step `i` from a state of the beam and e of the heights, with the given wheels `pressing`."""
     own = steps.length_index[i]
     on_beam = steps.at.on_beam[i, 0]
     transition = steps.transition[own]
@@ -336,17 +341,17 @@ def advance(law: ContactLaw, steps: Steps, i: int, pressing, state, e) -> Piece:
     free = (transition @ state.reshape(blocks, side, 1)).reshape(POINTS.size, -1)
     free_e = steps.of_e[own] @ e + steps.at_rest[i]
     weight = steps.at.weight[i, NODES].T
-    force = np.where((~law.contact & on_beam)[:, None], weight, 0.0)  # given ones
+    force = np.where((~law.contact & on_beam)[:, None], weight, 0.0)  # of wheels without a law
     index = np.flatnonzero(pressing)
     if index.size:
-        known = steps.law_known[i, index] + steps.law_e[index] @ free_e[NODES].T
+        constant = steps.law_constant[i, index] + steps.law_e[index] @ free_e[NODES].T
         rows, compliance = steps.law_rows[i][:, index], steps.compliance[i, index]
-        known = known + (rows @ free[NODES, :, None])[..., 0].T
+        constant = constant + (rows @ free[NODES, :, None])[..., 0].T
         size = index.size * NODE_COUNT
-        known = known.ravel() + compliance.reshape(size, -1) @ force.ravel()
+        constant = constant.ravel() + compliance.reshape(size, -1) @ force.ravel()
         matrix = compliance[:, :, index].reshape(size, size)
         sprung = np.repeat(law.sprung[index], NODE_COUNT)
-        found = _forces(law, matrix, known, sprung, weight[index].ravel())
+        found = _forces(law, matrix, constant, sprung, weight[index].ravel())
         force[index] = found.reshape(index.size, NODE_COUNT)
     if force.any():
         free = free + (steps.forced[i] @ force.ravel()).reshape(free.shape)
@@ -360,13 +365,16 @@ def advance(law: ContactLaw, steps: Steps, i: int, pressing, state, e) -> Piece:
     return Piece(start, length, on_beam, pressing.copy(), force, free, free_e, gap)
 
 
-def _forces(law: ContactLaw, matrix, known, sprung, start):
-    """Forces F = known + matrix F, or of springs of contact by this compression: by Newton."""
+def _forces(law: ContactLaw, matrix, constant, sprung, start):
+    """Forces F with F = constant + matrix F; by Newton's method for contact springs.
+
+    For a contact spring, constant + matrix F is the compression, and F the force at it.
+    """
     if not sprung.any():
-        return np.linalg.solve(np.eye(known.size) - matrix, known)
+        return np.linalg.solve(np.eye(constant.size) - matrix, constant)
     force = start
     for _ in range(NEWTON_ITERATIONS):
-        argument = known + matrix @ force
+        argument = constant + matrix @ force
         of_spring, stiffness = law.of_compression(argument)
         found, slope = np.where(sprung, of_spring, argument), np.where(sprung, stiffness, 1.0)
         change = np.linalg.solve(np.eye(force.size) - slope[:, None] * matrix, found - force)

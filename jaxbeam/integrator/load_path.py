@@ -20,8 +20,9 @@ class LoadPath(Module):
     `length_index` is the index of a step's length among those of the grid; start and length are in
     s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
     under all wheels, and its first and second rate, where there is a profile. `influence` is the
-    static one of a force of each wheel at the peak nodes on corrected outputs, `ends` the wheels at
-    the ends of steps; `kinks` tell which steps are passages over kinks, if there are any.
+    static influence of a force of each wheel at the peak nodes on corrected outputs, `ends` the
+    rows of the wheels at the ends of steps; `kinks` mark the steps that are passages over kinks, if
+    there are any.
     """
 
     length_index: Int[Array, " step"]
@@ -37,14 +38,14 @@ class LoadPath(Module):
 
     @property
     def pressing(self) -> Bool[Array, "step load"]:
-        """Which wheels on the beam press on it by forces, not by impulses as in passages."""
+        """Whether each wheel acts on the beam by a force, not by an impulse of a passage."""
         return self.on_beam if self.kinks is None else self.on_beam & ~self.kinks.here[:, None]
 
 
 def wheels_on_beam(grid: TimeGrid, max_loads: int) -> Int[Array, "panel wheel"]:
-    """Indices of at most `max_loads` wheels in each panel, those on the beam first.
+    """Indices of at most `max_loads` wheels in each panel, wheels on the beam first.
 
-    It depends on no step, so that compiled programs sort once.
+    They do not depend on the step, so that compiled programs sort once.
     """
     return xp.argsort(~grid.loads_on_beam, axis=1, stable=True)[:, :max_loads]
 
@@ -57,7 +58,7 @@ def load_path(
     model, grid = discrete.model, discrete.grid
     panel, start, length_index = grid.locate_steps(index)
     length = take(grid.lengths, length_index)
-    # As an array: JAX remembers a NumPy constant in the precision in which it met it first.
+    # As an array: JAX caches a NumPy constant in the precision of its first use.
     times = start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype)
     position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
     surface = loads.surface_motion(position, speed, acceleration)
@@ -94,10 +95,10 @@ def load_path(
 def _static_influence(
     discrete: DiscreteModel, loads: LoadSet, start, length, load_index, on_beam, arms
 ):
-    """Static influence of wheels on corrected outputs at the peak nodes of steps.
+    """Static influence (step, load, sample, output) of wheels on corrected outputs at peak nodes.
 
-    It is (step, load, sample, output). At the ends of a step the limits within it: a wheel may pass
-    a sensor there, where moments have a kink and shear forces jump.
+    Values at the ends of a step are the limits within it: a wheel may pass a sensor there, where
+    moments have a kink and shear forces jump.
     """
     nodes = xp.asarray([*PEAK_NODES, 0.5], length.dtype)
     position = xp.moveaxis(loads.kinematics(start[:, None] + length[:, None] * nodes)[0], 0, 1)

@@ -1,9 +1,9 @@
-"""Peaks of many runs by the C integrator (`integrate_peaks.c`), of the wheel or of a C compiler.
+"""Peaks of many runs by the C integrator (`integrate_peaks.c`), from the wheel or compiled here.
 
-XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
-steps of all tasks. It serves sweeps of peaks of all quantities and of histories, without a
-controller or with one that acts at samples, in double precision, on CPUs. Where the wheel has none
-the first large sweep compiles it, once for a machine, in 1.2 s of processor time. Each new
+XLA splits a step into some forty loops over the runs of a batch; in C it is one loop, and one call
+takes all steps of all tasks. It serves sweeps of peaks of all quantities and of histories, without
+a controller or with one that acts at samples, in double precision, on CPUs. If the wheel has no
+library the first large sweep compiles it, once for a machine, in 1.2 s of processor time. Each new
 structure regains 3 s, as XLA has less to compile, or nothing (two spans, benchmark `first_answer`),
 and 4096 crossings 0.05 (3 modes) to 0.26 s (12 modes, benchmark `sweep`). XLA's own calls of C
 would take headers, an aligned workspace as one of the results, and rules of derivatives that no
@@ -44,7 +44,7 @@ from jaxbeam.runtime.native_library import Library
 
 PATH_NODES = NODE_COUNT + len(END_FRACTIONS)
 MIN_RUNS_TO_COMPILE = 1000  # smaller sweeps do not wait for a compiler
-# The same of a law, each of which is compiled by itself: in half a second, predictive ones in ten.
+# Runs with a controller from which its law is compiled: in half a second, a predictive one in ten.
 MIN_RUNS_OF_LOOPS = 32
 HEADERS = (
     *("constants", "contact", "load_path", "matrices", "peak_search", "preparation", "propagators"),
@@ -58,9 +58,9 @@ LIBRARY = Library(
 
 
 def chosen_for(case: Case, runs: int) -> bool:
-    """Whether a new sweep of peaks of a case uses the C integrator, or is to compile it first.
+    """Whether a new sweep of peaks of a case uses the C integrator, if need be compiling it first.
 
-    Sweeps of many runs do so where it is missing, and there is a compiler.
+    Sweeps of many runs compile it where it is missing and there is a compiler.
     """
     if not supports(case) or (case.controller is not None and runs < MIN_RUNS_OF_LOOPS):
         return False
@@ -71,7 +71,7 @@ def chosen_for(case: Case, runs: int) -> bool:
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
     plain = not has_settlement(case) and not may_have_kinks(case)
-    plain &= case.beam.torsional_rigidity is None  # its wheels press at a point of a line
+    plain &= case.beam.torsional_rigidity is None  # wheels off the axis twist the beam
     if case.controller is not None:  # accelerations would follow from the contact forces
         sampled = case.controller.period is not None
         plain &= sampled and not any(sensor.has_feedthrough for sensor in case.sensors)
@@ -82,8 +82,8 @@ def supports(case: Case) -> bool:
     )
 
 
-def has_courses(case: Case) -> bool:
-    """Whether the C integrator needs the `inputs_over_time` of a case, which NumPy computes."""
+def has_inputs_over_time(case: Case) -> bool:
+    """Whether a case has a profile or forces over time, which need `inputs_over_time`."""
     return case.profile is not None or any(load.force_histories() for load in case.loads)
 
 
@@ -100,10 +100,10 @@ def on_cpu() -> bool:
 class NativeInputs(NamedTuple):
     """Arguments of the C integrator after the mask, in the order of `workspace.h`.
 
-    Their first axis are the tasks, of length one where all share them. Tasks are batches of runs
-    without commands. With a history `samples` are the numbers of those at the boundaries of panels,
-    -1 for none, and `history_rows` are those from the state to its outputs. None stands for an
-    array without numbers: what a program returns takes 20 microseconds each.
+    A task is a batch of runs. The first axis of each array is that of the tasks, of length one if
+    all tasks have the same. `samples` are the sample numbers of a history at the boundaries of
+    panels, -1 for none, and `history_rows` are the output rows of the history on the state. None
+    stands for an empty array, as each array that a program returns takes 20 microseconds.
     """
 
     state_matrix: Float[Array, "task block state state"]
@@ -140,12 +140,12 @@ class NativeInputs(NamedTuple):
 
 
 class NativeLoop(NamedTuple):
-    """A sampled loop in C: its function, numbers of commands, and place of the failures.
+    """A sampled loop in C: its function, number of commands, and index of the failures in memory.
 
-    Of the `NativeInputs` `lengths_of_panels`, which panels of histories share too, and the three
-    after it are those of a loop: the index of the length of the steps of each panel, and of the
-    event at its start, -1 for none; the memory of the loop at the start, and the addresses of its
-    numbers. Commands are states that do not change between events.
+    Four fields of `NativeInputs` are those of a loop: `lengths_of_panels`, the index of the step
+    length of each panel (also used for histories); `events`, the event at the start of each panel,
+    -1 for none; `memory` of the loop at the start; `loop_numbers`, the addresses of its numbers.
+    Commands are states that do not change between events.
     """
 
     process: Any
@@ -154,7 +154,7 @@ class NativeLoop(NamedTuple):
 
 
 class _Loop(ctypes.Structure):
-    """A loop as C takes it."""
+    """`NativeLoop` as a C structure."""
 
     _fields_ = (
         ("process", ctypes.c_void_p),
@@ -165,7 +165,7 @@ class _Loop(ctypes.Structure):
 
 
 class _Argument(ctypes.Structure):
-    """An array as C takes it: address of its numbers, and the sizes of its axes."""
+    """Array as a C structure: address of its numbers, and the sizes of its axes."""
 
     _fields_ = (("numbers", ctypes.c_void_p), ("sizes", ctypes.c_int64 * 4))
 
@@ -173,7 +173,7 @@ class _Argument(ctypes.Structure):
 def model_inputs(
     model: ModalModel, outputs: OutputRows, correction: StaticCorrection | None
 ) -> dict[str, Any]:
-    """Those of the `NativeInputs` that a model determines, and outputs with their correction."""
+    """Fields of `NativeInputs` from a modal model and outputs with their static correction."""
     series = model.load_series
     linear = linear_outputs(model, outputs, correction)
     influence = linear.influence
@@ -196,10 +196,10 @@ def loop_model_inputs(
     correction: StaticCorrection | None,
     history_rows: Float[np.ndarray, "row state"] | None = None,
 ) -> dict[str, Any]:
-    """`model_inputs` of a model of one block with held commands, as states of each of its blocks.
+    """`model_inputs` of a closed loop: held commands are additional states of each block.
 
-    Modes that nothing couples are blocks of their own then. With the `history_rows` of the states
-    of the model those of the blocks are among the inputs.
+    The model has one block, which is split into uncoupled modes where it can be. `history_rows` on
+    the states of the model, if given, become rows on the states of the blocks.
     """
     found = model_inputs(model, outputs, correction)
     history = np.zeros((0, model.state_count)) if history_rows is None else history_rows
@@ -230,10 +230,10 @@ def batch_inputs(
     paths: tuple[Float[Array, "wheel piece"], Float[Array, "wheel piece 4"]],
     wheels: WheelSet,
 ) -> dict[str, Any]:
-    """Those of the `NativeInputs` that the grid and the loads of a batch of runs determine.
+    """Fields of `NativeInputs` from the time grid and the loads of a batch of runs.
 
-    The grid is of one step length a panel (`grid_by_step_length`), the paths are the cubics of the
-    `LoadSet`.
+    The grid has one step length for each panel (`grid_by_step_length`), the paths are the cubics of
+    the `LoadSet`.
     """
     breakpoints, cubics = paths
     return {
@@ -256,7 +256,7 @@ def batch_inputs(
 
 
 def shared_vehicles(inputs: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Matrices of vehicles of some inputs, with one run where all runs of each batch share them."""
+    """Matrices of vehicles reduced to one run, if they are equal in all runs; otherwise none."""
     names = ("vehicle_state_matrix", "vehicle_input_matrix", "vehicle_output_matrix")
     matrices = [inputs[name] for name in names]
     if matrices[0] is None or any(np.any(part != part[..., :1]) for part in matrices):
@@ -271,11 +271,11 @@ def inputs_over_time(
     lengths: Float[np.ndarray, "batch length"],
     one_profile: bool,
 ) -> dict[str, np.ndarray]:
-    """Those of the `NativeInputs` that are functions of time, of batches of known numbers.
+    """Fields of `NativeInputs` that are functions of time, for batches of concrete numbers.
 
-    Steps are so many a panel, from its start (s), of its length (s). `surface` is the motion of the
-    profile under all wheels, `load_forces` forces in addition to their weights, both at the Gauss
-    nodes and then at the ends of the steps; zero after the last step of a batch. Batches with
+    Each panel has `counts` steps of its length (s) from its start (s). `surface` is the motion of
+    the profile under all wheels, `load_forces` forces in addition to their weights, both at the
+    Gauss nodes and then at the ends of the steps; zero after the last step of a batch. Batches with
     `one_profile` are computed together.
     """
     all_times = [_path_nodes(*of_batch) for of_batch in zip(starts, counts, lengths, strict=True)]
@@ -322,10 +322,10 @@ def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: Nat
 
 
 class Integrated(NamedTuple):
-    """What the C integrator returns of all tasks.
+    """Results of the C integrator for all tasks.
 
-    Peaks, failures of the law of a loop, its largest amplitudes up to each of `growth_marks`, and
-    histories.
+    They are peaks, numbers of samples without a solution of the law, largest amplitudes up to each
+    of `growth_marks`, and histories.
     """
 
     peaks: Peaks
@@ -337,9 +337,9 @@ class Integrated(NamedTuple):
 def integrate_loops(
     max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs, loop: NativeLoop | None
 ) -> Integrated:
-    """Peaks of tasks, with histories at samples if the inputs have any.
+    """Results of tasks by the C integrator, with histories if the inputs have samples.
 
-    Only where C is `available`. Other threads of Python run meanwhile.
+    The C integrator must be `available`. The call releases the lock of Python for other threads.
 
     `max_loads` is the largest number of loads on the beam at once. Tasks not in the mask stay at
     rest. Raises MemoryError without memory for the matrices of the steps.
@@ -371,7 +371,7 @@ def integrate_loops(
 
 
 def _constants() -> tuple[np.ndarray, ...]:
-    """Nodes, weights and coefficients of the integrator, which all tasks share."""
+    """Nodes, weights and coefficients of the integrator, the same for all tasks."""
     constants = (
         np.asarray(GAUSS_NODES),
         lagrange_coefficients(NODE_COUNT),
@@ -384,13 +384,13 @@ def _constants() -> tuple[np.ndarray, ...]:
 
 
 def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
-    """First wheel, wheels and states of one vehicle, and number of vehicles, of loads with them."""
+    """Vehicle groups: first wheel, wheels and states of a vehicle, and number of vehicles."""
     numbers = [(group.first_wheel, *group.H.shape[-3:-1], group.count) for group in wheels.vehicles]
     return np.array(numbers, np.int64).reshape(-1, 4)
 
 
 def _vehicle_matrices(wheels: WheelSet, name: str) -> Float[Array, "entry run"] | None:
-    """Numbers of the matrices of all vehicles, one after the other, if there are any."""
+    """Entries of the matrices `name` of all vehicles, concatenated; None without vehicles."""
     matrices = [getattr(group, name) for group in wheels.vehicles]
     flat = [part.reshape(-1, part.shape[-1]) for part in matrices]
     return xp.concatenate(flat) if flat else None

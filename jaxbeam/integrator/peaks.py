@@ -34,7 +34,7 @@ from jaxbeam.runtime.arrays import (
 )
 from jaxbeam.runtime.module import Module
 
-PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
+PEAK_MARGIN = 1.1  # upper bound of a peak over the largest of the samples around it
 
 
 class Peaks(NamedTuple):
@@ -50,13 +50,13 @@ class Peaks(NamedTuple):
 
 
 class RunningPeaks(Module):
-    """Peaks of the runs of a batch so far.
+    """Peaks of the runs of a batch up to the current chunk of steps.
 
     `samples` are the deflections (m) at the peak nodes of the step with the largest `estimate` of
     the `magnitude` of each monitored deflection; that step has `step_start` (s) and `step_length`
     (s). Contact forces (N) are positive where a load presses on the beam; `contact_lost_time` (s)
     is the first instant of a tensile contact force. A run is `finite` until it diverges. The
-    `position` of the peak in its step, in [-1, 1], is known of a whole run only.
+    `position` of the peak in its step, in [-1, 1], is given only if all steps are one chunk.
     """
 
     estimate: Float[Array, "sensor batch"]
@@ -76,7 +76,7 @@ class RunningPeaks(Module):
         return xp.where(self.finite, value, xp.nan), xp.where(self.finite, time, xp.nan)
 
     def without(self, failed: Bool[Array, " batch"]) -> "RunningPeaks":
-        """The running peaks, with no peak or contact of runs that have diverged."""
+        """Running peaks in which diverged runs have no peak and no contact force."""
         finite = self.finite & ~failed
         contact = xp.where(finite, self.lowest_contact_force, xp.nan)
         lost = xp.where(finite, self.contact_lost_time, NEVER)
@@ -89,7 +89,7 @@ class RunningPeaks(Module):
     def with_contact(
         self, lowest: Float[Array, "load batch"], lost_time: Float[Array, "load batch"]
     ) -> "RunningPeaks":
-        """The running peaks with other lowest contact forces (N) and times of loss (s)."""
+        """Running peaks with other smallest contact forces (N) and times of loss (s)."""
         parts = lowest, lost_time
         return eqx.tree_at(
             lambda own: (own.lowest_contact_force, own.contact_lost_time), self, parts
@@ -107,8 +107,8 @@ def update_peaks(
 ) -> RunningPeaks:
     """Running peaks after a further chunk of steps.
 
-    `inputs` of the monitored outputs are states, contact forces, those at the ends of the steps and
-    commands; the last two may be None.
+    `inputs` of the monitored outputs are states, contact forces at the nodes, contact forces at the
+    ends of the steps, and commands; the last two may be None.
     """
     states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
@@ -117,16 +117,15 @@ def update_peaks(
     if path.influence is None:
         outputs = matrices.monitored @ xp.concatenate([states, *others], axis=1)
     else:
-        # By two products, with which sweeps of moments take a tenth less time, and those of
-        # deflections 3 % more.
+        # Two products: sweeps of moments take a tenth less time, those of deflections 3 % more.
         on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
         outputs = on_states @ states + on_others @ xp.concatenate(others, axis=1)
-        # Forces of loads that leave after the end are in steps of no length, no part of the run.
+        # Steps of zero length after the end are no part of the run.
         outputs = xp.where(length[:, None, None] > 0, outputs, 0.0)
     samples = optimization_barrier(outputs.reshape(steps, len(PEAK_NODES), -1, batch_size))
 
     largest = xp.max(xp.abs(samples), axis=(0, 1))
-    # Of a traced run whose steps are all in one chunk.
+    # Whether this is a traced run whose steps are all in one chunk.
     whole_run = is_jax(largest) and not is_jax(running_peaks.estimate)
 
     def updated(best):
@@ -151,14 +150,14 @@ def update_peaks(
     if whole_run:
         running_peaks = peaks_of_steps(running_peaks, samples, start, length)
     else:
-        # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
+        # Most chunks stay far below the current peak and lose no contact: they skip refinement.
         running_peaks = cond(
             xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
             updated,
             lambda best: best,
             running_peaks,
         )
-    # Loads off the beam do not count, nor do impulses.
+    # Loads off the beam and impulses do not count.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
     ) & path.pressing[..., None]
@@ -179,7 +178,7 @@ def update_peaks(
 
 
 def peaks_of_steps(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
-    """Peaks of a run whose steps are all known at once: by products, without branches."""
+    """Running peaks of a traced run with all steps in one chunk, computed without branches."""
     fixed, magnitude = stop_gradient(samples), initial.magnitude
     steps = steps_beside_peak(fixed, stop_gradient(length), PEAK_NODES, magnitude)
     candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)

@@ -1,4 +1,4 @@
-"""Static shapes of a case: what compiled code depends on besides numbers."""
+"""Static shapes of a case: data other than numbers on which compiled code depends."""
 
 import dataclasses
 
@@ -47,7 +47,7 @@ def model_limits(case: Case, layout: Layout):
 
 
 def longest_stable_step(case: Case, model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
-    """Longest step (s) that is stable, and resolves the passages of forces."""
+    """Longest step (s) that is stable and resolves the passages of forces."""
     return xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
 
 

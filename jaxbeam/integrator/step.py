@@ -4,9 +4,8 @@ With the state z at the start of a step, its commands u and the contact forces f
 
     f = -(1 + m G)^-1 (m (R z + D u) + w),    z' = Phi z + B u + Gamma f
 
-are affine in z and u. Maps of all steps are found at once, before the states are known. What
-remains to be done step by step is a product of a matrix and a vector, in NumPy and in compiled
-programs.
+are affine in z and u. Maps of all steps are found at once, before the states are computed. Each
+step is then one product of a matrix and a vector, in NumPy and in compiled programs.
 """
 
 from typing import NamedTuple
@@ -36,7 +35,7 @@ from jaxbeam.runtime.arrays import (
 class AffineMap(NamedTuple):
     """Affine map of each step from the state and the commands: linear @ (z, u) + offset.
 
-    Runs of a batch may share the linear part, whose batch axis then has length one.
+    The batch axis of the linear part has length one where all runs of a batch have the same.
     """
 
     linear: Float[Array, "*step shared_or_batch row column"]
@@ -45,23 +44,23 @@ class AffineMap(NamedTuple):
     def at(
         self, i: int | slice, columns: Float[Array, "*step batch column"]
     ) -> Float[Array, "*step batch row"]:
-        """Values of one of several steps, or of some."""
+        """Values of the map of step `i`, or of a slice of steps, for given columns."""
         return AffineMap(self.linear[i], self.offset[i])(columns)
 
     def __call__(
         self, columns: Float[Array, "*step batch column"]
     ) -> Float[Array, "*step batch row"]:
-        """Values of all steps."""
+        """Values of the maps of all steps, for given columns."""
         if self.linear.shape[-3] == 1:
             return columns @ self.linear[..., 0, :, :].mT + self.offset
         return (self.linear @ columns[..., None])[..., 0] + self.offset
 
 
 class StepMaps(NamedTuple):
-    """Maps of steps to their contact forces, to the state at the end, and to those at the nodes.
+    """Affine maps of steps to their contact forces, states at the end, and states at the nodes.
 
-    Columns are states of the beam, then of the vehicles, then commands. The last map, of (node,
-    state), is None unless the step matrices have it.
+    Columns are states of the beam, then of the vehicles, then commands. The map to the states at
+    the nodes (node, state) is None unless the step matrices include them.
     """
 
     forces: AffineMap
@@ -70,7 +69,7 @@ class StepMaps(NamedTuple):
 
 
 def step_maps(step: StepInput, vehicles: Vehicles | None) -> StepMaps:
-    """Maps of the steps of a chunk."""
+    """Affine maps of the steps of a chunk."""
     matrices, commands, of_vehicles = step.matrices, step.matrices.commands, None
     if vehicles is None:
         of_columns, of_one = contact_maps(step)
@@ -80,13 +79,13 @@ def step_maps(step: StepInput, vehicles: Vehicles | None) -> StepMaps:
         states = vehicles.loads.vehicle_states
 
     def through_forces(response, *others):
-        """Map by the forces and, with `others` on beam, vehicles and commands, at once."""
+        """Map through the contact forces, plus the direct maps `others` of all columns."""
         linear, offset = (response[:, None] @ part for part in (of_columns, of_one))
         direct = [part for part in others if part.shape[-1]]
         direct = direct[0] if len(direct) == 1 else xp.concatenate(direct, axis=-1)
         if is_jax(direct):
             return linear + direct[:, None], offset
-        linear += direct[:, None]  # in place where it is known: the largest matrix of the steps
+        linear += direct[:, None]  # in place, as it is the largest matrix of the steps
         return linear, offset
 
     def no_effect(rows):
@@ -111,7 +110,7 @@ def step_maps(step: StepInput, vehicles: Vehicles | None) -> StepMaps:
 
 
 def block_diagonal(blocks: Float[Array, "step block side side"]) -> Float[Array, "step row column"]:
-    """Matrices of each step from the blocks on their diagonal."""
+    """Block-diagonal matrix of each step from its blocks."""
     steps, count, side, _ = blocks.shape
     if count == 1:
         return blocks[:, 0]
@@ -130,7 +129,7 @@ def contact_maps(step: StepInput):
         no_response = np.zeros((len(weight), 1, weight.shape[2], matrices.state_count + count))
         return no_response, -weight
     parts = [response, *([] if commands is None else [commands.contact_response])]
-    # Runs of the same wheels share the systems; weights are then right sides of one each.
+    # Runs of equal wheels have one system; their weights are then right-hand sides of it.
     shared = share_matrices(inertia)
     if shared:
         inertia, weight = inertia[:, :1], xp.moveaxis(weight, 1, -1)[:, :, 0][:, None]
@@ -147,7 +146,7 @@ def contact_maps(step: StepInput):
 
 
 def _forces(compliance, inertia, right: list) -> list:
-    """Contact forces of f + m G f = -d for several right sides d."""
+    """Contact forces f that solve f + m G f = -d, for several right-hand sides d."""
     sides = xp.concatenate(right, axis=-1)
     if isinstance(compliance, ModalCompliance):
         compliance = jax.tree.map(lambda part: part[:, None], compliance)
@@ -158,7 +157,7 @@ def _forces(compliance, inertia, right: list) -> list:
     return xp.split(forces, ends, axis=-1)
 
 
-MANY_RUNS = 16  # of a batch that NumPy advances by its contact forces, as maps of each take longer
+MANY_RUNS = 16  # from which NumPy advances a batch by contact forces, as maps of runs take longer
 
 
 @jax.named_scope("collocation")
@@ -210,8 +209,9 @@ def advance_free(transitions: Float[Array, "step block side side"], state):
 def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     """Steps without commands: final state, state before each step, and contact forces.
 
-    As one map a step, whose systems are solved at once. Plain wheels of a compiled batch, whose
-    runs share the matrices but not the maps, and of many known states by their contact forces.
+    Each step is one affine map, and the systems of all steps are solved at once. Batches of plain
+    wheels that are compiled, or of many concrete runs, are advanced by their contact forces
+    instead: their runs have the same matrices but different maps.
     """
     shared = is_jax(step.matrices.transition) or is_known(state) and state.shape[1] >= MANY_RUNS
     if vehicles is None and shared and state.shape[1] > 1:
@@ -226,7 +226,7 @@ def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
 
 
 def _states_of_maps(of_states: AffineMap, start: Float[Array, "batch state"]):
-    """States (boundary, batch, state) of steps that are affine maps, from the first one."""
+    """States (boundary, batch, state) of steps that are affine maps, from the initial state."""
     if any_jax(of_states, start):
 
         def advance(state, one):
@@ -251,7 +251,7 @@ def _states_of_maps(of_states: AffineMap, start: Float[Array, "batch state"]):
 
 
 def _advance_by_forces(step: StepInput, state):
-    """Steps of plain wheels by the contact forces, without matrices of all states."""
+    """`advance_unforced` of plain wheels by contact forces, without a matrix of all states."""
     of_columns, of_one = contact_maps(step)
     of_forces = AffineMap(of_columns, of_one[..., 0])
     matrices = step.matrices

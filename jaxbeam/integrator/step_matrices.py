@@ -46,20 +46,20 @@ from jaxbeam.runtime.arrays import (
 from jaxbeam.runtime.module import Module
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
-MANY_STATES = 48  # of which NumPy makes no matrix a step
-PREPARED_ENTRIES = 2**25  # of the largest matrix of all steps of a prepared run: 0.3 GB
-KNOWN_CHUNK_ENTRIES = 2**19  # of matrices that NumPy computes together, so that caches hold them
+MANY_STATES = 48  # from which NumPy makes no matrix of all states for a step
+PREPARED_ENTRIES = 2**25  # entries of the largest matrix of all steps of a prepared run: 0.3 GB
+NUMPY_CHUNK_ENTRIES = 2**19  # entries of matrices that NumPy computes together, to fit in caches
 
 
 class CommandMatrices(Module):
-    """From commands at the nodes to the acceleration under the loads and the state at the end."""
+    """Maps of commands at the nodes to the acceleration under the loads and the final state."""
 
     contact_response: Float[Array, "step row command"] | None
     input_matrix: Float[Array, "step state command"]
 
 
 class NodeMatrices(Module):
-    """From state at the start, contact forces and commands to the states at the Gauss nodes."""
+    """Maps of initial state, contact forces and commands to the states at the Gauss nodes."""
 
     transition: Float[Array, "step node_state state"]
     force_response: Float[Array, "step node_state row"]
@@ -67,10 +67,9 @@ class NodeMatrices(Module):
 
 
 class SpringMatrices(Module):
-    """To deflections and velocities under the wheels at the nodes.
+    """Maps of initial state, contact forces and commands to the motion under the wheels at nodes.
 
-    From the state at the start, the contact forces, and the commands; one of the motions, or both
-    along an axis `motion`.
+    The motion is deflection or velocity, or both along an axis `motion`.
     """
 
     response: Float[Array, "step *motion row state"]
@@ -83,9 +82,9 @@ class StepMatrices(Module):
 
     `contact_response` maps the state at the start to the acceleration under the loads at the
     nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
-    `springs` are None where no wheel has springs. `monitored` acts on state at the start, contact
-    forces, those at the ends if outputs follow them at once, and commands, one after the other. A
-    step is `loaded` with a load on the beam.
+    `springs` are None where no wheel has springs. The columns of `monitored` are state at the
+    start, contact forces at the nodes, contact forces at the ends if outputs respond to them
+    directly, and commands. A step is `loaded` with a load on the beam.
     """
 
     contact_response: Float[Array, "step row state"] | None
@@ -105,9 +104,10 @@ class StepMatrices(Module):
 
 
 def advances_by_forces(states: int) -> bool:
-    """Whether NumPy propagates so many states by the contact forces, not by one matrix a step.
+    """Whether NumPy propagates this number of states by contact forces, not by one matrix a step.
 
-    A step takes more operations then, whose sizes grow with the number of states, not its square.
+    A step then takes more operations, but their sizes grow with the number of states and not with
+    its square.
     """
     return states >= MANY_STATES
 
@@ -122,8 +122,8 @@ def chunk_length(
 ) -> int:
     """Number of steps whose matrices are computed together.
 
-    In NumPy, where each operation takes microseconds to begin, as many as caches hold; of
-    `prepared` steps, which a program takes as they are, all if they fit into memory.
+    NumPy, where each operation takes microseconds to begin, takes as many as caches hold. All of
+    the `prepared` steps of a traced run are together, if they fit into memory.
     """
     if any_jax(discrete) and not prepared:
         return CHUNK_STEPS
@@ -146,7 +146,7 @@ def chunk_length(
         return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
     if any_jax(loads):
         return CHUNK_STEPS
-    return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
+    return int(max(1, min(discrete.grid.step_count, NUMPY_CHUNK_ENTRIES // entries)))
 
 
 @jax.named_scope("load_path")
@@ -166,7 +166,7 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
 
 
 def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
-    """Rows of monitored outputs, with the static influence of the forces at the peak nodes.
+    """Rows of monitored outputs with the static influence of the forces at the peak nodes added.
 
     Peak nodes are the start, the Gauss nodes and the end of a step.
     """
@@ -174,7 +174,7 @@ def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
     first, samples = discrete.model.state_count, monitored.shape[1]
 
     def of_forces(influence, peaks):
-        """Rows on forces at these peak nodes, each of which acts on the outputs there."""
+        """Rows on forces at some peak nodes: a force acts on the outputs at its own node."""
         at = np.eye(len(PEAK_NODES))[:, peaks]
         return xp.einsum("pf,tlps->tpslf", at, influence).reshape(steps, samples, -1)
 
@@ -186,7 +186,7 @@ def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
 
 
 def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
-    """Matrices of the steps of a chunk of known lengths: those of one length together."""
+    """Matrices of the steps of a chunk in NumPy, computed together for steps of equal length."""
     steps = np.arange(len(path.length_index))
     indices = [steps[path.length_index == kind] for kind in set(path.length_index)]
 
@@ -197,7 +197,7 @@ def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
 
     if len(indices) == 1:
         return matrices_of(steps)
-    # Written one length after the other into the place of all: concatenated, they take thrice it.
+    # Written into preallocated arrays: concatenation would take three times the memory.
     whole: Any = None
     for index in indices:
         part = matrices_of(index)
@@ -208,7 +208,7 @@ def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
 
 
 def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
-    """Matrices of the steps of a chunk of traced lengths."""
+    """Matrices of the steps of a chunk with traced lengths, which may be equal or not."""
     # Chosen outside the branches: inside, derivatives would pass through all lengths.
     first_propagators = _propagators_of(discrete, path.length_index[0])
 
@@ -224,22 +224,23 @@ def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
 
         return map_elements(single_step, (path.length_index, path.rows))
 
-    # In most chunks all steps are equally long and share their propagators.
+    # In most chunks all steps are equally long and have the same propagators.
     return cond(
         xp.all(path.length_index == path.length_index[0]), equal_lengths, mixed_lengths, None
     )
 
 
 def _propagators_of(discrete: DiscreteModel, length_index):
-    """Propagators of steps of one length, or of each of several, and their monitored rows."""
+    """Propagators and monitored rows for one index of a step length, or for several."""
     parts = discrete.propagators, discrete.monitored_transition, discrete.monitored_input
     return jax.tree.map(lambda part: take(part, length_index), parts)
 
 
 def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows, t: str = ""):
-    """Matrices of steps, from rows (step, load, node, ...).
+    """Matrices of steps from the rows `motion` (step, load, node, ...) at the wheels.
 
-    Propagators are those of one length, or with "t", the label of their first axis, of each step.
+    Propagators are those of one length, or of each step if `t` is "t", the label of their first
+    axis.
     """
     shape, rows = motion.shape, motion.acceleration
     of_states, deflection_transition, deflection_force_response = propagators
@@ -256,7 +257,7 @@ def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows
     force_response = xp.einsum(f"tqfbm,{t}fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
     def for_all_steps(matrix, *shape):
-        """Matrices of each step, in a shape."""
+        """Matrix repeated for each step, reshaped."""
         first = (steps,) if t else ()
         matrix = matrix.reshape(*first, *(shape or matrix.shape[len(first) :]))
         return xp.broadcast_to(matrix, (steps, *matrix.shape[len(first) :]))
@@ -315,7 +316,7 @@ def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows
 
 
 def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> SpringMatrices:
-    """Matrices to one motion of the surface under the wheels, deflection or velocity."""
+    """Maps to the deflection or the velocity of the surface under the wheels, from its `rows`."""
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
     response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
@@ -333,10 +334,10 @@ def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> Spri
 
 
 def _contact_compliance(input_nodes, shape, rows, by_factors, t):
-    """Acceleration under the loads at the nodes due to contact forces of one newton.
+    """Acceleration (m/s^2) under the loads at the nodes due to contact forces of one newton.
 
-    As a product of two factors where the generalised forces are fewer than the contact forces, if
-    `by_factors`.
+    With `by_factors` it is a product of two factors where generalised forces are fewer than contact
+    forces.
     """
     steps, load_count, nodes, blocks, modes = shape.shape
     size = load_count * nodes
@@ -353,7 +354,7 @@ def _contact_compliance(input_nodes, shape, rows, by_factors, t):
 
 
 def _command_response(discrete: DiscreteModel, command_responses, shape, rows, t):
-    """Acceleration under the loads at the nodes due to commands of one at the nodes."""
+    """Acceleration (m/s^2) under the loads at the nodes due to unit commands at the nodes."""
     response = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], command_responses)
     feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
     return response + feedthrough[:, :, :, None] * np.eye(shape.shape[2])[:, :, None]
@@ -364,7 +365,7 @@ def weights_with_impulses(
     inertia: Float[Array, "step row batch"],
     weight: Float[Array, "step row batch"],
 ) -> Float[Array, "step row batch"]:
-    """Weights (N) of the rows (wheel and node) of steps; m |v| [r'] (N s) in passages."""
+    """Weights (N) of the rows (wheel and node) of steps; m |v| [r'] (N s) in kink passages."""
     steps, loads = kinks.profile.shape
     others = xp.zeros((steps, loads, inertia.shape[1] // loads - 1))
     jumps = xp.concatenate([kinks.profile[..., None], others], axis=2).reshape(steps, -1, 1)
@@ -377,12 +378,15 @@ def with_impulses(
     shape: Float[Array, "step load node block mode"],
     model: ModalModel,
 ) -> StepMatrices:
-    """Matrices of steps, with those of passages, from the mode shapes at the wheels."""
+    """Matrices of steps, replaced by those of impulses in kink passages.
+
+    `shape` are the mode shapes at the wheels.
+    """
     steps, loads, nodes = shape.shape[:3]
     shapes = shape[:, :, 0].reshape(steps, loads, -1)
 
     def at_first_node(like, axes: tuple[int, ...], index, values):
-        """Values at an index, where rows along some axes are split into wheel and node."""
+        """`like` with values at an index in passages; rows along `axes` are (wheel, node)."""
         size: list[Any] = list(like.shape)
         for axis in sorted(axes, reverse=True):
             size[axis : axis + 1] = loads, nodes
@@ -402,7 +406,7 @@ def with_impulses(
     forces = at_first_node(matrices.force_response, (2,), index, xp.swapaxes(shapes, 1, 2))
 
     def absent(matrices):
-        """What has no effect in a passage: commands, and springs of wheels."""
+        """Matrices that are zero in a passage: those of commands and of the springs of wheels."""
         commands, springs = matrices.commands, matrices.springs
         parts = [] if commands is None else [commands.contact_response]
         if springs is not None:
@@ -419,5 +423,5 @@ def with_impulses(
 
 
 def _in_passages(kinks: KinkSteps, values, others):
-    """Values in passages, others in the other steps."""
+    """`values` in steps that are kink passages, `others` in other steps."""
     return xp.where(kinks.here.reshape(-1, *(1,) * (others.ndim - 1)), values, others)

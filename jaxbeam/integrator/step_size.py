@@ -4,7 +4,7 @@ A run of the case is compared with one whose steps are half as long. The order o
 least CONVERGENCE_ORDER, so that the next trial is close to the longest step that suffices.
 
 Where forces change sharply, the error depends on where in a step they do: the forces that Gauss
-nodes integrate worst are those with a singularity near the middle of a step, beside the real axis
+nodes integrate worst are those with a singularity near the middle of a step, close to the real axis
 (Trefethen 2008, "Is Gauss quadrature better than Clenshaw-Curtis?"). Errors of equal
 steps that begin elsewhere have differed by a factor of five hundred. So wherever samples are no
 closer than steps, the steps of the trials are those of the run itself, between its samples.
@@ -35,36 +35,36 @@ from jaxbeam.runtime.arrays import Array
 
 MAX_TRIALS = 40  # step sizes tried
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
-CLOSE_SAMPLES = 0.5  # share of a step; closer ones need no trial with their own steps
+CLOSE_SAMPLES = 0.5  # fraction of a step; closer samples need no trial with their own steps
 MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
 NO_STEP = (
     "no time step makes the response agree to {:g}; it is unstable, or its frequencies are too far"
     " apart: check stiffnesses, masses and damping, or keep fewer modes (beam.modes); or a law in"
     " continuous time switches too often: give it a period, or a larger tolerance"
 )
-ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are not compared
+ROUNDING = 1e-9  # fraction of the deflection under all loads; smaller ones are not compared
 SMALLEST_TOLERANCE = 1e-14  # some fifty units in the last place of double precision
-LARGEST_ROUNDING = 1e-9  # an error that shorter steps do not lessen, and that may be rounding
-UNSAMPLED = 2.0  # errors at all positions and times over the largest of those compared
+LARGEST_ROUNDING = 1e-9  # largest error that may be rounding, where shorter steps do not lessen it
+UNSAMPLED = 2.0  # largest error at any position and time over the largest one that is compared
 LEAST_TRIAL_POSITIONS = 8  # at which errors are measured
 TRIAL_CHUNK = 2048  # times of a trial whose deflections are compared at once
 
 
 class StepTrial(NamedTuple):
-    """States of two trial runs at the same `times` (s): with some steps, and with half of them.
+    """States of two trial runs at the same `times` (s): `coarse`, and `fine` with halved steps.
 
-    Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
-    those of the `former` trial, if there was one. Steps are so many `substeps` of the intervals of
-    a schedule, if that is not zero; else they begin at load events, and the `panels` are the times
-    (s) between those with loads on the beam, and the steps there. Errors of a run whose law is not
-    asked in the trial are the `amplification` of those of the trial.
+    States are those of the beam's modal model, then of vehicles. Errors are at least `error_ratio`
+    times those of the `former` trial, if there was one. With `substeps` steps divide the intervals
+    of a schedule; if it is zero they begin at load events, and `panels` are the times (s) between
+    load events with loads on the beam, and the steps (s) there. The error of a run is
+    `amplification` times that of the trial where the trial leaves the control law out.
     """
 
     times: Float[np.ndarray, " time"]
     coarse: Float[np.ndarray, "time state batch"]
     fine: Float[np.ndarray, "time state batch"]
     former: "StepTrial | None" = None
-    share: float = 0.0
+    error_ratio: float = 0.0
     substeps: int = 0
     panels: Float[np.ndarray, "2 panel"] = np.zeros((2, 0))
     amplification: float = 1.0
@@ -81,17 +81,17 @@ def check_step_count(count: float, step: float) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raises ValueError for a tolerance that is no share, or below double precision, or traced."""
+    """Raises ValueError for a tolerance not below 1, below double precision, or traced."""
     refuse_traced("a tolerance", "give a known number", tolerance)
     if not SMALLEST_TOLERANCE <= tolerance < 1:
         raise ValueError(
-            f"tolerance must be at least {SMALLEST_TOLERANCE:g} and below 1, as a share of the"
+            f"tolerance must be at least {SMALLEST_TOLERANCE:g} and below 1, as a fraction of the"
             f" largest deflection in double precision; it is {tolerance:g}"
         )
 
 
 class ErrorFloor:
-    """Notices that errors of ever shorter steps no longer fall: they are rounding then.
+    """Detector of rounding errors: they do not fall with ever shorter steps.
 
     The order of the integrator divides an error by 512 at least as steps are halved.
     """
@@ -100,7 +100,7 @@ class ErrorFloor:
         self._tolerance, self._best, self._step = tolerance, np.inf, np.inf
 
     def check(self, error: float, step: float) -> None:
-        """Take note of the error of a step (s).
+        """Record the error of a step (s).
 
         Raises RuntimeError if a sixteenth of the step of a small error has not halved it. (Between
         close load events there is one step, and an error that falls only when it is divided.)
@@ -123,10 +123,10 @@ def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
 def choose_step_size(
     case: Case, shapes: StaticShapes, tolerance: float, schedule: EventSchedule | None = None
 ) -> tuple[float, float, StepTrial]:
-    """Longest step (s) whose deflections meet the `tolerance`, and their error.
+    """Longest step (s) whose deflections meet the `tolerance`, their error, and the last trial.
 
-    The last is the trial from which the error is known. With a `schedule` of samples its steps are
-    those of a run that is sampled so, unless samples are closer than CLOSE_SAMPLES of a step.
+    The error is measured in the last trial. With a `schedule` of samples the trial takes the steps
+    of a run with these samples, unless samples are closer than CLOSE_SAMPLES of a step.
 
     The step is shortened until dividing it by two changes no deflection at the trial positions and
     the ends of its steps by more than half the tolerance, relative to the largest; the error is
@@ -155,12 +155,12 @@ def choose_step_size(
         )
         trial = StepTrial(times, coarse, fine[::2], substeps=substeps)
         change = UNSAMPLED * largest_change(case, model, coarse, trial.fine, least)
-        error, share = change, shrink**CONVERGENCE_ORDER
+        error, ratio = change, shrink**CONVERGENCE_ORDER
         if not substeps:
-            error, trial = max(change, share * former_error), trial._replace(former=former)
+            error, trial = max(change, ratio * former_error), trial._replace(former=former)
         if error <= tolerance:
             panels = _loaded_panels(case, model, events, step)
-            return step, error, trial._replace(share=share, panels=panels)
+            return step, error, trial._replace(error_ratio=ratio, panels=panels)
         floor.check(change, step)
         shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
@@ -179,16 +179,16 @@ def steps_per_interval(interval: float, max_step: float) -> int:
 
 
 def _until(schedule: EventSchedule, end: float) -> EventSchedule:
-    """The schedule of samples without those after the first one that is not before an end (s)."""
+    """Schedule of samples up to the first one at or after an end (s)."""
     count = max(2, int(np.searchsorted(schedule.times, end)) + 1)
     times, index = schedule.times[:count], schedule.length_index[: count - 1]
     return EventSchedule(times, index, schedule.lengths, np.arange(len(times)))
 
 
 def _step_and_substeps(schedule: EventSchedule | None, step: float) -> tuple[float, int]:
-    """The longest of equal steps (s) in the intervals of a schedule, and their number in each.
+    """Longest of the equal steps (s) in the intervals of a schedule, and their number in each.
 
-    The step itself and zero where intervals are shorter than CLOSE_SAMPLES of it.
+    It is the given step, and zero, where intervals are shorter than CLOSE_SAMPLES of the step.
     """
     interval = 0.0 if schedule is None else float(np.max(schedule.lengths))
     if interval < CLOSE_SAMPLES * step:
@@ -205,11 +205,11 @@ def _grids(
     schedule: EventSchedule | None,
     substeps: int,
 ) -> list[TimeGrid]:
-    """Grids of a trial: of steps (s), or so many in each interval, and of steps half as long."""
+    """Two grids of a trial: with a step (s) or `substeps` per interval, and with halved steps."""
     if schedule is None or not substeps:
         max_step = np.asarray(step)
         return [
-            grid_by_step_length(case, model, max_step, refinement=n, known_events=events)
+            grid_by_step_length(case, model, max_step, refinement=n, given_events=events)
             for n in (1, 2)
         ]
     check_step_count(float(schedule.times.size * substeps), step)
@@ -219,17 +219,17 @@ def _grids(
 def _loaded_panels(
     case: Case, model: ModalModel, events: LoadEvents, step: float
 ) -> Float[np.ndarray, "2 panel"]:
-    """Times (s) between load events with loads on the beam, and steps there of at most a `step`.
+    """Lengths (s) of the panels with loads on the beam, and their steps (s) of at most `step`.
 
-    Without those of no length, between events at one time.
+    Panels of zero length, between events at one time, are left out.
     """
-    grid = grid_by_step_length(case, model, np.asarray(step), known_events=events)
+    grid = grid_by_step_length(case, model, np.asarray(step), given_events=events)
     times, loaded = np.diff(grid.boundaries), np.any(grid.loads_on_beam, axis=1)
     return np.stack([times, np.asarray(grid.lengths)[:-1]])[:, loaded & (times > 0)]
 
 
 def without_later_vibration(case: Case, model: ModalModel, loads: LoadSet) -> Case:
-    """The case until one period of the lowest mode after the last exit.
+    """Case whose run ends one period of the lowest mode after the last exit, or earlier.
 
     Free vibration is exact with any step, and no error grows in it.
     """
@@ -242,9 +242,9 @@ def without_later_vibration(case: Case, model: ModalModel, loads: LoadSet) -> Ca
 def trial_run(
     case: Case, model: ModalModel, loads: LoadSet, max_loads: int, max_step: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Boundaries of steps of at most `max_step` (s), and states there (boundary, state, batch).
+    """Step boundaries (s) and states there (boundary, state, batch) of a run without controller.
 
-    Of a run without controller, with at most `max_loads` on the beam at once.
+    Steps are at most `max_step` (s), with at most `max_loads` on the beam at once.
     """
     grid = grid_by_step_length(case, model, np.asarray(max_step))
     return run_of_grid(grid, model, loads, max_loads)
@@ -261,7 +261,7 @@ def run_of_grid(
 
 
 def trial_positions(case: Case) -> Float[Array, " position"]:
-    """Positions (m) at which errors are measured: twice as many as modes, lest some are missed."""
+    """Positions (m) at which errors are measured: twice as many as modes, to resolve all modes."""
     count = max(LEAST_TRIAL_POSITIONS, 2 * case.beam.modes)
     return case.beam.length * (np.arange(count) + 0.5) / count
 
@@ -273,10 +273,10 @@ def largest_change(
     fine: Float[np.ndarray, "time state batch"],
     least: float,
 ) -> float:
-    """Largest change of deflections at the trial positions from one run to another, by states.
+    """Largest relative change of deflections at the trial positions between two runs.
 
-    Relative to the largest deflection of each run of the batch in the `fine` one, or to `least` (m)
-    where that is larger; of some times after others.
+    `coarse` and `fine` are states. The change is relative to the largest deflection of each `fine`
+    run of the batch, or to `least` (m) where that is larger.
     """
     rows, own = model.shapes(trial_positions(case), (0,))[0], np.s_[:, 0 : 2 * case.beam.modes : 2]
     coarse, fine = coarse[own], fine[own]
@@ -291,9 +291,10 @@ def largest_change(
 
 
 def rounding_deflection(case: Case, model: ModalModel, loads: LoadSet) -> float:
-    """Deflection (m) that may be all rounding: a share of that of all loads at the trial positions.
+    """Deflection (m) below which changes may be rounding: ROUNDING of that under all loads.
 
-    Loads that stand on supports deflect nothing, and rounding falls with no step.
+    Loads that stand on supports cause no deflection, and their rounding does not fall with the
+    step.
     """
     times = np.linspace(0.0, float(concrete(case.run.duration)), 100)
     weight = np.max(np.sum(np.abs(loads.varying_weight(times)), axis=1), initial=0.0)

@@ -1,10 +1,10 @@
 """Time grid: panels of equal steps between events and samples.
 
-Events known before a run (samples, control samples, breakpoints of commands) are merged into one
-schedule, so that steps end there, with the actions at each event. A load event is a time at which
-the motion is not smooth: a load enters, leaves, stops, or passes a support or the end of a patch;
-its time may be traced. No step contains one inside. The structure of the case fixes the number of
-panels, so the grid can be compiled; a panel of zero length has no effect.
+Events scheduled before a run (samples, control samples, breakpoints of commands) are merged into
+one schedule, so that steps end there, with the actions at each event. A load event is a time at
+which the motion is not smooth: a load enters, leaves, stops, or passes a support or the end of a
+patch; its time may be traced. No step contains one inside. The structure of the case fixes the
+number of panels, so the grid can be compiled; a panel of zero length has no effect.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from jaxbeam.runtime.arrays import (
 )
 from jaxbeam.runtime.module import Module
 
-SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
+SAME_TIME_FRACTION = 1e-9  # of the duration: closer times are one event
 MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own
 
 
@@ -46,14 +46,15 @@ class EventSchedule(Module):
     `reading_age` is the number of readings made since the one that is available at an event,
     `command_age` the number of commands made since the one that takes effect, -1 for none;
     `max_age` and `max_waiting` are their maxima. A sensor makes at most `max_readings`. Lost
-    readings and commands are left out; `missing` says that the reading due last has been lost, and
-    `assumed_age` is the number of commands made since the one that acts at a sample according to a
-    law that does not know of losses and random delays. Both are None without these.
+    readings and commands are left out; `missing` is true where the latest due reading was lost, and
+    `assumed_age` is the command age that a law assumes if it does not model losses and random
+    delays. Both are None without losses and random delays.
 
-    In a schedule that moves with the numbers of the case, no two actions share an event, and
-    `source` is the index of each event's time among those that `moved` is given, -1 for a time
-    that stays. `merging` (s) is added to it, by less than SAME_TIME_SHARE, so that times that were
-    equal but for rounding are; `source_counts` are the numbers of times of each kind of action.
+    In a schedule that moves with the numbers of the case, each action has its own event, and
+    `source` is the index of the event's time in the argument of `moved`, -1 for a fixed time.
+    `merging` (s) is added to the time, less than SAME_TIME_FRACTION of the duration, so that times
+    equal but for rounding are equal; `source_counts` are the numbers of times of each kind of
+    action.
     """
 
     times: Float[Array, " event"]
@@ -74,7 +75,7 @@ class EventSchedule(Module):
     source_counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def moved(self, times: Float[Array, " time"]) -> "EventSchedule":
-        """The schedule with these times (s) of its actions, in the order of `source`."""
+        """Schedule with new times (s) of its actions, in the order of `source`."""
         own = take(times, xp.maximum(self.source, 0)) + self.merging
         times = in_order(xp.where(self.source < 0, self.times, own))
         return dataclasses.replace(self, times=times, lengths=xp.diff(times))
@@ -82,10 +83,10 @@ class EventSchedule(Module):
 
 @custom_jvp
 def in_order(times: Float[Array, " event"]) -> Float[Array, " event"]:
-    """Times (s) of events in their order, which rounding must not change where two are equal.
+    """Times (s) of events made non-decreasing, as rounding may swap equal times.
 
-    A compiler that multiplies and adds at once rounds `k * period` otherwise in each expression.
-    Derivatives are those of the times.
+    A compiler with fused multiply-add rounds `k * period` differently in each expression.
+    Derivatives are those of the given times.
     """
     ordered: Any = jax.lax.cummax(times) if is_jax(times) else np.maximum.accumulate(times)
     return ordered
@@ -97,12 +98,12 @@ def _(primals, tangents):
 
 
 def moving_with_end(times: Float[Array, " time"], end: Float[Array, ""]) -> Float[Array, " time"]:
-    """Times (s), of which those at the `end` (s) of a run, but for rounding, are the end itself.
+    """Times (s), with those within rounding of the `end` (s) of a run replaced by the end.
 
-    What is done at the end of a run changes nothing before: derivatives of a peak at the end are
-    those of the motion at a fixed time, or by the end, not by the times of the actions there.
+    Actions at the end of a run do not change its motion. Derivatives of a peak at the end are those
+    at a fixed time, or with respect to the end, not to the times of the actions there.
     """
-    at_end = stop_gradient(times) >= stop_gradient(end) * (1 - SAME_TIME_SHARE)
+    at_end = stop_gradient(times) >= stop_gradient(end) * (1 - SAME_TIME_FRACTION)
     return xp.where(at_end, end, times)
 
 
@@ -138,9 +139,9 @@ def sample_schedule(
 
 
 class Transmission(NamedTuple):
-    """Times (s) at which readings of a sensor, or commands, begin their way and arrive.
+    """Times (s) at which readings of a sensor, or commands, are sent and arrive.
 
-    `lost` are those that do not arrive, None for none.
+    `lost` is true for those that do not arrive; None if all arrive.
     """
 
     sent: Float[np.ndarray, " number"]
@@ -149,12 +150,12 @@ class Transmission(NamedTuple):
 
     @property
     def is_lost(self) -> Bool[np.ndarray, " number"]:
-        """Whether each does not arrive."""
+        """Whether each reading or command is lost."""
         return np.zeros(self.sent.size, bool) if self.lost is None else self.lost
 
     @property
     def received(self) -> Int[np.ndarray, " received"]:
-        """Numbers of those that arrive."""
+        """Indices of the readings or commands that arrive."""
         return np.flatnonzero(~self.is_lost)
 
 
@@ -167,18 +168,16 @@ def controller_schedule(
     assumed_age: int | None = None,
     moving: bool = False,
 ) -> EventSchedule:
-    """Schedule of a run with a controller, from rest at zero to the `end` (s).
+    """Schedule of a run with a controller, from zero to the `end` (s), or to the last sample.
 
-    By default it ends with the last sample, before which it never does.
+    The schedule never ends before the last sample. The controller acts when its `commands` are
+    sent. A command takes effect when it arrives, unless a newer one has arrived. The `readings` of
+    each sensor are those of the signal when they are sent; they are available as they arrive, in
+    the order of sending. `breakpoints` (s) are those of prescribed commands.
 
-    The controller acts when its `commands` are sent, which take effect as they arrive, but not
-    after a newer one. The `readings` of each sensor are those of the signal when they are sent;
-    they are available as they arrive, in their order. `breakpoints` (s) are those of prescribed
-    commands.
-
-    A `moving` schedule has its actions at separate events, those at one time in the order in which
-    they take place: breakpoints, readings of each sensor, control, commands, samples, end. In this
-    order `EventSchedule.moved` takes their times.
+    A `moving` schedule has a separate event for each action; events at one time are in the order
+    breakpoints, readings of each sensor, control, commands, samples, end. `EventSchedule.moved`
+    takes the times in this order.
     """
     end = float(sample_times[-1] if end is None else max(end, sample_times[-1]))
     control_times, begun = commands.sent, commands.received
@@ -197,21 +196,21 @@ def controller_schedule(
             ]
         )
     )
-    all_times = all_times[(all_times >= 0) & (all_times <= end * (1 + SAME_TIME_SHARE))]
-    times = all_times[np.diff(all_times, prepend=-np.inf) > SAME_TIME_SHARE * end]
+    all_times = all_times[(all_times >= 0) & (all_times <= end * (1 + SAME_TIME_FRACTION))]
+    times = all_times[np.diff(all_times, prepend=-np.inf) > SAME_TIME_FRACTION * end]
     # Events merged with a sample take its exact time.
     nearest_sample = np.clip(
-        np.searchsorted(sample_times, times - SAME_TIME_SHARE * end), 0, sample_times.size - 1
+        np.searchsorted(sample_times, times - SAME_TIME_FRACTION * end), 0, sample_times.size - 1
     )
     times = np.where(
-        np.abs(sample_times[nearest_sample] - times) <= SAME_TIME_SHARE * end,
+        np.abs(sample_times[nearest_sample] - times) <= SAME_TIME_FRACTION * end,
         sample_times[nearest_sample],
         times,
     )
 
     def in_run(kind, numbers):
         wanted = kinds[kind][numbers]
-        tolerance = SAME_TIME_SHARE * end
+        tolerance = SAME_TIME_FRACTION * end
         return numbers[(wanted >= -tolerance) & (wanted <= end + tolerance)]
 
     merged_times, sensors = times, len(readings)
@@ -224,7 +223,7 @@ def controller_schedule(
     source = merging = None
 
     def instants(wanted_times):
-        found = np.searchsorted(merged_times, wanted_times - SAME_TIME_SHARE * end)
+        found = np.searchsorted(merged_times, wanted_times - SAME_TIME_FRACTION * end)
         return np.clip(found, 0, merged_times.size - 1)
 
     if moving:
@@ -258,7 +257,7 @@ def controller_schedule(
             merging[has] = times[has] - kinds[i][at_events[has]]
 
     def newest_at_events(arrivals, numbers):
-        arrived = np.searchsorted(arrivals[numbers], times + SAME_TIME_SHARE * end, side="right")
+        arrived = np.searchsorted(arrivals[numbers], times + SAME_TIME_FRACTION * end, side="right")
         return np.append(numbers, -1)[arrived - 1]
 
     control_sample = number_at_events(control, used[control])
@@ -289,7 +288,7 @@ def controller_schedule(
         ]
     gaps = np.diff(times)
     lengths, length_index = np.unique(
-        np.round(gaps / (1e-2 * SAME_TIME_SHARE * end)), return_inverse=True
+        np.round(gaps / (1e-2 * SAME_TIME_FRACTION * end)), return_inverse=True
     )
     if moving or lengths.size > MAX_DISTINCT_GAPS:
         length_index = np.arange(gaps.size)
@@ -343,13 +342,13 @@ LoadEvents = tuple[Float[Array, "wheel 2"], Float[Array, " event"]]
 class TimeGrid(Module):
     """Panels between `boundaries` (s), each with a number of equal steps.
 
-    `counts` are the numbers of steps of the panels, `cumulative_counts` those up to the end of
-    each. `length_index` is the index of a panel's step length among `lengths` (s), whose last is
-    zero: that of the steps after the end, which fill the last chunk. `event` is the index of the
-    scheduled event at which a panel starts, -1 for a load event; `event_panels` is the panel that
-    starts at each scheduled event. `on_beam_intervals` are entry and exit of each load (s).
-    `passage` is the index of the passage over a kink, among the `kinks`, that is the first step of
-    a panel of no length; -1 for none.
+    `counts` are the numbers of steps of the panels, `cumulative_counts` their sums up to the end of
+    each panel. `length_index` is the index of a panel's step length among `lengths` (s); the last
+    length is zero, for the steps after the end that fill the last chunk. `event` is the index of
+    the scheduled event at which a panel starts, -1 for a load event; `event_panels` is the panel
+    that starts at each scheduled event. `on_beam_intervals` are entry and exit of each load (s).
+    `passage` is the index in `kinks` of the passage that is the first step of a panel of zero
+    length; -1 for other panels.
     """
 
     boundaries: Float[Array, " boundary"]
@@ -400,7 +399,7 @@ class TimeGrid(Module):
         return (index == self._first_step(panel)) & (index < self.step_count)
 
     def with_halves(self, index: Int[np.ndarray, " step"]) -> "TimeGrid":
-        """Grid with twice the steps, that has the lengths of the halves of some steps only."""
+        """Grid of halved steps, with lengths only for the halves of the steps in `index`."""
         _, _, kinds = self.locate_steps(index)
         own = np.unique(kinds)
         return dataclasses.replace(
@@ -419,21 +418,22 @@ class TimeGrid(Module):
 def event_places(
     model: ModalModel, places: Float[Array, " place"] | None
 ) -> Float[Array, " event_place"]:
-    """Places (m) at which a passing wheel is a load event: those of the model, and some more."""
+    """Places (m) at which a passing wheel is a load event: breaks of the model, and `places`."""
     own = model.load_breaks
     return own if places is None else xp.concatenate([own, model.load_places(places)])
 
 
-def _events_between(case: Case, model: ModalModel, places, start, end, known=None, loads=None):
-    """Events of the loads, if not `known`, clipped to start and end, and passages over kinks.
+def _events_between(case: Case, model: ModalModel, places, start, end, given=None, loads=None):
+    """Load events, computed unless `given`, clipped to start and end, and passages over kinks.
 
-    Of these each time twice: a panel of no length lies in between. Then the passages, and the
-    index of each, -1 for one that does not happen, whose times are the end.
+    Returns entry and exit of each wheel (s), times of load events (s), times of the passages (s),
+    each repeated as a panel of zero length lies in between, the passages, and the index of each;
+    the index is -1 and the time the end for a passage that does not happen.
     """
-    if known is None:
+    if given is None:
         loads = load_set(case, model.modes.layout) if loads is None else loads
-        known = loads.events(event_places(model, places))
-    windows, events = known
+        given = loads.events(event_places(model, places))
+    windows, events = given
     events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
     if kinks is None:
         return windows, events, xp.zeros(0), None, np.zeros(0, int)
@@ -446,8 +446,9 @@ def _events_between(case: Case, model: ModalModel, places, start, end, known=Non
 def _loads_on_beam(positions, panels: int):
     """Whether each wheel is on the beam in each panel, (panel, wheel).
 
-    From the positions of its entry and exit, one after the other, among the boundaries: so a panel
-    of no length between a sample and an exit at the same time has its derivative.
+    `positions` are the indices of entry and exit of each wheel among the boundaries. Indices rather
+    than times give a panel of zero length, between a sample and an exit at the same time, the
+    right derivative.
     """
     entry, leave = positions.reshape(-1, 2).T
     index = np.arange(panels)[:, None]
@@ -461,19 +462,19 @@ def grid_by_step_length(
     extra_steps: int | Int[Array, ""] = 0,
     places: Float[Array, " place"] | None = None,
     refinement: int = 1,
-    known_events: LoadEvents | None = None,
+    given_events: LoadEvents | None = None,
 ) -> TimeGrid:
     """Panels between load events, with steps of at most `max_step` (s).
 
-    With a `refinement` each of these steps is divided into so many. The events of the loads at
-    all `event_places` can be given, if they are known.
+    With a `refinement` each of these steps is divided into so many. `given_events` of the loads at
+    all `event_places` are computed unless they are given.
 
     `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
     the `places` (m).
     """
     end = case.run.duration
-    found = _events_between(case, model, places, np.zeros(()), end, known_events)
+    found = _events_between(case, model, places, np.zeros(()), end, given_events)
     return _grid_of_steps(found, end, max_step, extra_steps, refinement)
 
 
@@ -483,7 +484,7 @@ def grid_between_events(
     max_step: Float[Array, ""],
     extra_steps: int | Int[Array, ""] = 0,
 ) -> TimeGrid:
-    """`grid_by_step_length` of known load events, where no wheel with mass passes a kink."""
+    """`grid_by_step_length` from given load events, without passages over kinks."""
     windows, events = load_events
     events = xp.clip(events, 0.0, duration)
     found = windows, events, np.zeros(0), None, np.zeros(0, int)
@@ -491,7 +492,7 @@ def grid_between_events(
 
 
 def _grid_of_steps(found, end, max_step, extra_steps, refinement: int = 1) -> TimeGrid:
-    """Grid with steps of at most a length between the events that `_events_between` has found."""
+    """Grid with steps of at most `max_step` (s) between events `found` by `_events_between`."""
     windows, events, twice, kinks, index = found
     times = xp.concatenate([xp.zeros(1), events, twice, end[None]])
     order = xp.argsort(times, stable=True)
@@ -523,9 +524,9 @@ def _grid_of_steps(found, end, max_step, extra_steps, refinement: int = 1) -> Ti
 
 
 def _passage_of_panels(positions, index, panels: Int[Array, " panel"]):
-    """Index of the passage that is the first step of each of the panels, -1 for none.
+    """Index of the passage that is the first step of each panel, -1 for none.
 
-    From the panels that start with the passages of some indices, which are -1 for none.
+    `positions` are the panels that start with the passages in `index`, which is -1 for none.
     """
     return put(xp.full_like(panels, -1), xp.where(index < 0, panels.shape[0], positions), index)
 
@@ -536,17 +537,17 @@ def grid_by_schedule(
     schedule: EventSchedule,
     substeps: int | Int[Array, ""],
     places: Float[Array, " place"] | None = None,
-    known_events: LoadEvents | None = None,
+    given_events: LoadEvents | None = None,
     loads: LoadSet | None = None,
 ) -> TimeGrid:
     """Panels between the events of a schedule and the load events, of `substeps` steps each.
 
-    Nearly all panels share a few step lengths, hence their propagators. Steps also end where a
-    wheel passes one of the `places` (m). The loads, or their events at all `event_places`, can be
-    given, if they are known.
+    Nearly all panels have one of a few step lengths, hence the same propagators. Steps also end
+    where a wheel passes one of the `places` (m). The loads, or `given_events` of them at all
+    `event_places`, are computed unless they are given.
     """
     times = schedule.times
-    between = times[0], times[-1], known_events, loads
+    between = times[0], times[-1], given_events, loads
     windows, events, twice, kinks, index = _events_between(case, model, places, *between)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.

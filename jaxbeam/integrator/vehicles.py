@@ -13,7 +13,7 @@ y = R z + G f + D u under the wheels, the contact law
 
 is solved for f as an affine function of the states z of the beam and z_v of the vehicles, and of
 the commands u; the states of the vehicles at the end of the step follow. The maps of all steps are
-found at once, before the states are known.
+found at once, before the states are computed.
 """
 
 import math
@@ -67,7 +67,7 @@ def vehicle_state_norm(loads: LoadSet) -> Float[Array, ""]:
 
 
 def _scaled_systems(group: VehicleGroup):
-    """State, input and output matrices with displacements scaled to the size of rates."""
+    """State, input and output matrices with displacements scaled to the size of rates; scales."""
     dofs = group.A.shape[0] // 2
     frequency = xp.sqrt(1.0 + xp.max(xp.sum(xp.abs(group.A[dofs:, :dofs]), axis=1), axis=0))
     shape = (dofs, *frequency.shape)
@@ -84,7 +84,7 @@ def vehicle_propagators(
         return _propagators(group, lengths)
 
     def of_length(length):
-        """Most panels of a compiled program are empty."""
+        """Propagators over a step; to first order if it is empty, as most of a program are."""
         parts = cond(
             length > 0, lambda t: _propagators(group, t), lambda t: _at_once(group, t), length[None]
         )
@@ -94,7 +94,7 @@ def vehicle_propagators(
 
 
 def _at_once(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
-    """Propagators over steps of no length (s), to first order: events at one time may part."""
+    """Propagators over steps of zero length (s), to first order, for derivatives by event times."""
     A, B, H = (xp.asarray(part, lengths.dtype) for part in (group.A, group.B, group.H))
     states, wheels, batch_size = B.shape
     rows = wheels * NODE_COUNT
@@ -139,10 +139,11 @@ def _propagators(group: VehicleGroup, lengths: Float[Array, " length"]) -> Vehic
 
 
 class VehicleStep(Module):
-    """Wheels of the rows of a step, and the surface, for each step of a chunk.
+    """Wheels of vehicles in each step of a chunk, and the surface under them.
 
-    `length_index` is that of the step's length; `on_beam` tells which wheels are there; `surface`
-    is the motion of the profile under all wheels (see `LoadPath`).
+    `length_index` is that of the step's length; `wheels` are the indices of the wheels of the rows,
+    and whether they are `on_beam`; `surface` is the motion of the profile under all wheels (see
+    `LoadPath`).
     """
 
     length_index: Int[Array, " *step"]
@@ -152,7 +153,7 @@ class VehicleStep(Module):
 
 
 class StepInput(Module):
-    """What a step of a batch takes: matrices, and inertia (kg) and weight (N) of the rows.
+    """Inputs of the steps of a batch: matrices, and inertia (kg) and weight (N) of the rows.
 
     The weight includes the inertia forces of the profile. Without vehicles, `vehicles` is None.
     """
@@ -179,9 +180,10 @@ def vehicles_of(loads: LoadSet, lengths: Float[Array, " length"]) -> Vehicles | 
 
 
 def vehicle_maps(vehicles: Vehicles, step: StepInput):
-    """Linear part and offset of the map to contact forces, and both of that to vehicles' states.
+    """Affine maps to the contact forces (linear part, offset), and to the states of the vehicles.
 
-    All (step, batch, row, column); columns are states of the beam, of the vehicles, and commands.
+    All are (step, batch, row, column); columns are states of the beam, of the vehicles, and
+    commands. The map to the states is a pair of linear part and offset.
     """
     matrices, loads, wheels = step.matrices, vehicles.loads, vehicles.loads.wheels
     steps, batch = step.inertia.shape[0], step.inertia.shape[-1]
@@ -217,7 +219,7 @@ def vehicle_maps(vehicles: Vehicles, step: StepInput):
 
 
 def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
-    """S and O at the rows, and S q of the profile, of the steps (step, batch, row, ...)."""
+    """Matrices S and O at the rows of the steps, and S q of the profile (step, batch, row, ...)."""
     loads, wheels, length = vehicles.loads, step.wheels, step.length_index
     on_beam = xp.repeat(step.on_beam, NODE_COUNT, axis=1)[:, None, :, None]
     profile = _profile(vehicles, step, batch)
@@ -254,7 +256,7 @@ def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
 
 
 def _profile(vehicles: Vehicles, step: VehicleStep, batch: int) -> Float[Array, "step batch row 1"]:
-    """q of the profile at all wheels and nodes of the steps."""
+    """Spring forces q = k y + c y' (N) of the profile at all wheels and nodes of the steps."""
     wheels = vehicles.loads.wheels
     shape = len(step.wheels), batch, vehicles.loads.wheel_count * NODE_COUNT, 1
     if step.surface is None:
@@ -265,7 +267,7 @@ def _profile(vehicles: Vehicles, step: VehicleStep, batch: int) -> Float[Array, 
 
 
 def _state_maps(vehicles: Vehicles, step: StepInput, surface):
-    """Maps of the steps to the states of the vehicles at their ends; the last column is of one.
+    """Maps of the steps to the states of the vehicles at their ends; the last column is the offset.
 
     `surface` is the map to q = k y + c y' of the beam at the rows.
     """
@@ -296,7 +298,7 @@ def _state_maps(vehicles: Vehicles, step: StepInput, surface):
 
 
 def _rows_of(group: VehicleGroup, vehicle: int) -> slice:
-    """Rows (wheel and node) of a vehicle of a load among those of all wheels."""
+    """Slice of the rows (wheel, node) of a vehicle of a load among the rows of all wheels."""
     rows = group.wheels_per_vehicle * NODE_COUNT
     start = group.first_wheel * NODE_COUNT + vehicle * rows
     return slice(start, start + rows)

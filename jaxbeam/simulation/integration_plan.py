@@ -518,7 +518,7 @@ def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) ->
     model = modal_model(case, shapes.layout, shapes.coupled)
     errors = trial.amplification * step_errors(case, model, trial)
     if trial.former is not None:
-        errors = np.maximum(errors, trial.share * step_errors(case, model, trial.former))
+        errors = np.maximum(errors, trial.error_ratio * step_errors(case, model, trial.former))
     return tuple(map(float, errors))
 
 
