@@ -34,7 +34,7 @@ from jaxbeam.model.sensing.sensor_signals import (
 )
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.numerics.discretisation import propagate
-from jaxbeam.runtime.arrays import Array, any_jax, known, ravel_pytree, xp
+from jaxbeam.runtime.arrays import Array, any_jax, ravel_pytree, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
 
@@ -329,7 +329,7 @@ def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     controller = case.controller
     continuous = controller.period is None and not controller.open_loop
     build = _compiled_dynamics if continuous else _direct_dynamics
-    return known(build(case, compiled_modal_model(case, layout)))
+    return to_numpy(build(case, compiled_modal_model(case, layout)))
 
 
 def _loop_dynamics(case, model):

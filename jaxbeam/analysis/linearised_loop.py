@@ -35,11 +35,11 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import (
     Array,
     any_traced,
-    known,
     ravel_pytree,
     scan,
     solve,
     stop_gradient,
+    to_numpy,
     xp,
     zeros,
 )
@@ -339,20 +339,20 @@ def _linearise(derivatives, loop: LoopDynamics, timing, t) -> LinearisedLoop:
     constant = 0.0 if timing is None else np.eye(start.shape[0])
 
     def newton_step(state):
-        change, A, B, K = known(derivatives(loop, timing, t, state))
+        change, A, B, K = to_numpy(derivatives(loop, timing, t, state))
         return state + xp.linalg.lstsq(A + B @ K - constant, -change)[0]
 
     if any_traced(loop, t):
         state = scan(lambda x, _: (newton_step(x), None), start, length=NEWTON_ITERATIONS)[0]
     else:
-        state = known(start)
+        state = to_numpy(start)
         for _ in range(NEWTON_ITERATIONS):
             previous, state = state, newton_step(state)
             if np.max(np.abs(state - previous)) <= NEWTON_ROUNDING * np.max(np.abs(state)):
                 break
     # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
     state = stop_gradient(xp.where(xp.all(xp.isfinite(state)), state, start))
-    _, A, B, K = known(derivatives(loop, timing, t, state))
+    _, A, B, K = to_numpy(derivatives(loop, timing, t, state))
     period = None if timing is None else timing.period
     return LinearisedLoop(A, B, K, period, 2 * loop.plant.coordinate_scale.shape[0])
 

@@ -29,7 +29,7 @@ from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.discretisation import propagate
-from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
+from jaxbeam.runtime.arrays import ravel_pytree, scan, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.4  # rad: phase of the fastest mode per step of the transition matrix
@@ -190,7 +190,7 @@ def _transition_matrices(
             return _affine_transitions(loop, timing, times, substeps), _energy_matrix(loop)
         except NotAffineError:
             pass
-    return known(_compiled_transitions(loop, timing, times, substeps)), _energy_matrix(loop)
+    return to_numpy(_compiled_transitions(loop, timing, times, substeps)), _energy_matrix(loop)
 
 
 def _affine_transitions(loop: LoopDynamics, timing: LoopTiming, times, substeps: int):

@@ -43,7 +43,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import known
+from jaxbeam.runtime.arrays import to_numpy
 from jaxbeam.runtime.c_translation import renew
 from jaxbeam.runtime.c_writer import (
     CArray,
@@ -93,7 +93,7 @@ def export_c(case: Case, name: str) -> CProgram:
         raise ValueError("controller is missing: there is nothing to export; add one to the case")
     if controller.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
-    law = known(_designed(case, mesh_layout(case)))
+    law = to_numpy(_designed(case, mesh_layout(case)))
     loop = recorded_loop(case, law, MAX_SAMPLES)
     period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
     samples = math.floor(duration / period * (1 + 1e-12)) + 1

@@ -28,7 +28,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     sensor_sections,
     to_reading,
 )
-from jaxbeam.runtime.arrays import Array, any_jax, known, take, vmap, xp
+from jaxbeam.runtime.arrays import Array, any_jax, take, to_numpy, vmap, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import (
@@ -97,7 +97,7 @@ class FilteredLaw(AbstractSampledLaw):
             measurement = measurement._replace(readings=xp.stack(readings))
         step = self.law.step(law_state, measurement, t)
         if not any_jax(measurement):  # also of laws that use JAX for known numbers
-            step = known(step)
+            step = to_numpy(step)
         state = FilteredState(step.state, after, measurement.readings)
         return ControlStep(step.command, state, step.solved)
 

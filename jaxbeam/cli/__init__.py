@@ -1,7 +1,7 @@
 """Command line: commands read arguments, call the library and print what it returns."""
 
-from jaxbeam.runtime.own_packages import find_beside
+from jaxbeam.runtime.own_packages import find_siblings
 
-find_beside()  # commands import `tuning` and `experiments`, of which the folder may have others
+find_siblings()  # the working folder may have other modules named `tuning` or `experiments`
 
 from jaxbeam.cli.app import main as main  # noqa: E402

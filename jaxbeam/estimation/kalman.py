@@ -24,7 +24,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.arrays import Array, Number, known, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled
 
 
@@ -218,7 +218,7 @@ class Kalman(AbstractKalmanEstimator):
 
         initial_covariance = xp.diag(xp.append(zero_state, self.load_variance(plant)))
         Q = xp.pad(intensity, (0, start.shape[0]))
-        table = known(_dual_gains(filtered, end, self.points, Q, noise, initial_covariance))
+        table = to_numpy(_dual_gains(filtered, end, self.points, Q, noise, initial_covariance))
         return ContinuousCrossingFilter(
             offset,
             xp.append(zero_state, start),

@@ -17,7 +17,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     to_reading,
 )
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import known
+from jaxbeam.runtime.arrays import to_numpy
 from jaxbeam.simulation.commands import command_path
 
 CLOCK_TOLERANCE = 1e-6  # of a period, by which a time may miss a sample
@@ -59,7 +59,7 @@ class ControllerSteps:
         self._period = float(controller.period)
         self._delay = 0.0 if controller.delay is None else float(controller.delay)
         plant = state_space(case, layout=mesh_layout(case))
-        self._law, self._wanted = known(controller.law(plant)), np.zeros(len(case.actuators))
+        self._law, self._wanted = to_numpy(controller.law(plant)), np.zeros(len(case.actuators))
         self._sections = [sensor_sections(sensor, self._period) for sensor in case.sensors]
         self._path = command_path(case)
         self._memory = self._path.start(1, round(np.ceil(self._delay / self._period)))

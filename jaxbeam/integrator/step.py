@@ -23,7 +23,7 @@ from jaxbeam.runtime.arrays import (
     any_jax,
     cond,
     is_jax,
-    is_known,
+    is_numpy,
     scan,
     set_at,
     solve_conditioned,
@@ -213,7 +213,7 @@ def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     wheels that are compiled, or of many concrete runs, are advanced by their contact forces
     instead: their runs have the same matrices but different maps.
     """
-    shared = is_jax(step.matrices.transition) or is_known(state) and state.shape[1] >= MANY_RUNS
+    shared = is_jax(step.matrices.transition) or is_numpy(state) and state.shape[1] >= MANY_RUNS
     if vehicles is None and shared and state.shape[1] > 1:
         final_state, (states, forces) = scan(advance, state, step)
         return final_state, states, forces

@@ -29,7 +29,7 @@ from jaxbeam.model.theory.statics import SectionFlexibility
 from jaxbeam.model.theory.torsion import TwistFlexibility, twist_flexibility
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, add_at, is_known, set_at, solve, take, xp
+from jaxbeam.runtime.arrays import Array, add_at, is_numpy, set_at, solve, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
 
@@ -215,7 +215,7 @@ def peak_under_loads(
         forces = loads.varying_weight(within)[..., 0]
         active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
         active = active & (ends[part] - starts[part] > SHORTEST * (times[-1] - times[0]))
-        if is_known(active):
+        if is_numpy(active):
             wheel, at = np.nonzero(active)
         else:
             wheel, at = np.divmod(np.arange(loads.wheel_count * part.size), part.size)
@@ -247,7 +247,7 @@ def _intervals(case: Case, loads: LoadSet, breaks, wave_intervals: int):
     end = xp.maximum(last, case.run.duration) if wave_intervals else last + 1.0
     grid = first + (end - first) * np.linspace(0.0, 1.0, wave_intervals + 2)
     times = xp.concatenate([xp.where(happens, events, first), grid])
-    return windows, np.unique(times) if is_known(times) else xp.sort(times)
+    return windows, np.unique(times) if is_numpy(times) else xp.sort(times)
 
 
 def intervals_of_waves(case: Case) -> int:

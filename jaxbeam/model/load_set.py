@@ -21,7 +21,7 @@ from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractTrajectory, has_come
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.settlement import surface
-from jaxbeam.runtime.arrays import Array, add_at, is_jax, is_known, xp
+from jaxbeam.runtime.arrays import Array, add_at, is_jax, is_numpy, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -104,7 +104,7 @@ class WheelSet(Module):
     @property
     def massless(self) -> bool:
         """Whether all wheels certainly have no inertia or springs: forces are weights."""
-        return not self.vehicles and is_known(self.inertia) and not np.any(self.inertia)
+        return not self.vehicles and is_numpy(self.inertia) and not np.any(self.inertia)
 
     def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
         """Wheels and vehicles of similar loads, with all masses, springs and dampers in proportion.

@@ -27,7 +27,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.theory.elements import rigidity_at
 from jaxbeam.model.theory.torsion import twists
-from jaxbeam.runtime.arrays import Array, is_known, set_at, solve, xp
+from jaxbeam.runtime.arrays import Array, is_numpy, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
 OF_TWIST = TWIST, TWIST_RATE
@@ -144,7 +144,7 @@ def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layou
     """Residual of the modes under the contact forces, (time, *position)."""
     on_beam = xp.isfinite(motion.load_position)  # wheels of vehicles press on the ground, too
     arms = load_set(case, layout).eccentricity if twists(case) else None
-    if not all(map(is_known, jax.tree.leaves((case, motion, x)))):
+    if not all(map(is_numpy, jax.tree.leaves((case, motion, x)))):
         positions = xp.where(on_beam, motion.load_position, 0.0)
         residual = _under_loads(case, x, positions, derivative, layout, arms)
         return xp.einsum("tl,tl...->t...", xp.where(on_beam, motion.contact_force, 0.0), residual)

@@ -1,9 +1,9 @@
-"""Array functions for NumPy and JAX: known numbers are computed at once, traced ones are recorded.
+"""Array functions for NumPy and JAX: concrete numbers are computed, traced ones are recorded.
 
 `xp` has the functions that `numpy` and `jax.numpy` share. A function of `xp` is that of JAX if one
 of its arguments is an array of JAX (in `jit`, `grad` or `vmap` a tracer), else that of NumPy, which
 needs no compiler: the same lines serve the first answer and the compiled, differentiated program.
-The other functions here replace what the two write differently: indexed updates, loops, branches.
+The other functions here serve where the two libraries differ: indexed updates, loops, branches.
 """
 
 import functools
@@ -20,7 +20,7 @@ from jaxbeam.runtime.vectorised import VectorisedArray
 
 _NOT_JAX = {np.ndarray, VectorisedArray, np.float64, np.int64, np.bool_, float, int, bool, str}
 _NOT_JAX |= {type(None), slice}
-MAX_TRIANGLE_ROWS = 64  # of triangular systems that are solved as general ones
+MAX_TRIANGLE_ROWS = 64  # largest triangular system that is solved as a general one
 
 
 def is_jax(value: Any) -> bool:
@@ -32,8 +32,8 @@ def is_jax(value: Any) -> bool:
     return isinstance(value, jax.Array)
 
 
-def is_known(value: Any) -> bool:
-    """Whether an array is one of NumPy, with the numbers of one case."""
+def is_numpy(value: Any) -> bool:
+    """Whether an array is one of NumPy: neither of JAX nor a `VectorisedArray`."""
     return not is_jax(value) and not isinstance(value, VectorisedArray)
 
 
@@ -43,14 +43,16 @@ def any_jax(*trees: Any) -> bool:
 
 
 def any_traced(*trees: Any) -> bool:
-    """Whether any leaf of some trees is traced by JAX, so that its number is not known."""
+    """Whether any leaf of some trees is traced by JAX."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 class _Product(NamedTuple):
-    """A sum of products of two arrays as a product of matrices: axes of each, in their order.
+    """Subscripts of `einsum` for two arrays as a product of matrices.
 
-    Those of both in the result, those of one of them alone, and those that are summed.
+    `first` and `second` are orders of the axes: axes of both that are in the result (`batch` in
+    number), axes of one array only (`left` of the first), and axes that are summed. `output` is the
+    order of the axes of the result.
     """
 
     first: tuple[int, ...]
@@ -62,7 +64,7 @@ class _Product(NamedTuple):
 
 @functools.cache
 def _product(subscripts: str) -> _Product | None:
-    """The product of matrices for the subscripts of two arrays, None where there is none."""
+    """Product of matrices for subscripts of `einsum`; None for others than such products."""
     inputs, _, output = subscripts.partition("->")
     first, comma, second = inputs.partition(",")
     if not comma or "," in second or "." in subscripts or not output:
@@ -100,43 +102,43 @@ def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
 
 
 def _asarray(value: Any, dtype: Any = None) -> Any:
-    """`numpy.asarray`, which is outside of the protocols of NumPy."""
+    """`numpy.asarray` that also takes a `VectorisedArray`."""
     if isinstance(value, VectorisedArray):
         return value if dtype is None else value.astype(dtype)
     return np.asarray(value, dtype)
 
 
 def _array(value: Any, *args: Any, **kwargs: Any) -> Any:
-    """`numpy.array`, of vectorised numbers too."""
+    """`numpy.array` that also takes a list of `VectorisedArray`s."""
     if isinstance(value, list) and any(isinstance(part, VectorisedArray) for part in value):
         return np.stack(value)
     return np.array(value, *args, **kwargs)
 
 
 class _Namespace:
-    """Functions of two libraries under one name; see the module."""
+    """Namespace of functions that call NumPy or JAX, by the type of their arguments."""
 
-    def __init__(self, known, traced):
-        self._known, self._traced = known, traced
+    def __init__(self, concrete, traced):
+        self._concrete, self._traced = concrete, traced
 
     def __getattr__(self, name):
-        known = getattr(self._known, name)
+        concrete = getattr(self._concrete, name)
         traced: Any = lapack if name == "linalg" else getattr(self._traced, name)
-        known = {"einsum": _einsum, "array": _array, "asarray": _asarray}.get(name, known)
+        concrete = {"einsum": _einsum, "array": _array, "asarray": _asarray}.get(name, concrete)
         if name in ("linalg", "fft"):
-            attribute: Any = _Namespace(known, traced)
-        elif isinstance(known, type) or not callable(known):
-            attribute = known
+            attribute: Any = _Namespace(concrete, traced)
+        elif isinstance(concrete, type) or not callable(concrete):
+            attribute = concrete
         else:
 
-            @functools.wraps(known)
+            @functools.wraps(concrete)
             def call(*args, **kwargs):
                 for value in args:
                     if type(value) not in _NOT_JAX and is_jax(value):
                         return traced(*args, **kwargs)
                 if kwargs and any(map(is_jax, kwargs.values())):
                     return traced(*args, **kwargs)
-                return known(*args, **kwargs)
+                return concrete(*args, **kwargs)
 
             attribute = call
 
@@ -164,12 +166,12 @@ else:
 
 
 def array_namespace(*values: Any) -> Any:
-    """The library that `xp` takes for some values, chosen once for a loop of many small calls."""
+    """`jax.numpy` or `numpy`, as `xp` chooses for some values; for loops of many small calls."""
     return jnp if any(map(is_jax, values)) else np
 
 
 def take(array, index) -> Any:
-    """Entries at an index along the first axis, one that may be traced in a known array."""
+    """Entries at an index along the first axis; the index may be traced in an array of NumPy."""
     if isinstance(index, VectorisedArray) and not isinstance(array, VectorisedArray):
         return vectorised.take(array, index)
     return jnp.asarray(array)[index] if is_jax(index) else array[index]
@@ -187,20 +189,20 @@ def set_at(array, index, value) -> Any:
 
 
 def add_at(array, index, value) -> Any:
-    """Copy of an array with a value added to the entries at an index; repeated ones accumulate."""
+    """Copy of an array with a value added at an index; values at repeated indices accumulate."""
     if is_jax(array) or is_jax(index) or is_jax(value):
         return jnp.asarray(array, jnp.result_type(array, value)).at[index].add(value)
     array = np.array(array, np.result_type(array, value))
     parts = index if isinstance(index, tuple) else (index,)
     if all(isinstance(part, slice | int) or part is Ellipsis for part in parts):
-        array[index] += value  # none is repeated; ten times as fast
+        array[index] += value  # no index is repeated; ten times as fast
     else:
         np.add.at(array, index, value)
     return array
 
 
 def with_blocks(shape: tuple[int, ...], blocks) -> Any:
-    """Zeros of a shape with some blocks set, each at its index."""
+    """Array of zeros of a shape, with some blocks (pairs of index and values) set."""
     blocks = list(blocks)
     array: Any = zeros(shape, [values for _, values in blocks])
     for index, values in blocks:
@@ -224,7 +226,7 @@ def put(array, index, values) -> Any:
 
 
 def checkpoint(function: Callable, policy: Callable) -> Callable:
-    """`jax.checkpoint`: in reverse mode, save only what the policy names."""
+    """`jax.checkpoint` of a function; a call without arrays of JAX is direct."""
     checkpointed = jax.checkpoint(function, policy=policy)
 
     def call(*args):
@@ -233,30 +235,30 @@ def checkpoint(function: Callable, policy: Callable) -> Callable:
     return call
 
 
-def known(tree) -> Any:
-    """The same tree with arrays of NumPy for those of JAX that are not traced."""
+def to_numpy(tree) -> Any:
+    """Tree with its concrete arrays of JAX converted to NumPy; traced ones are unchanged."""
 
-    def to_numpy(leaf):
-        is_known = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer)
-        return np.asarray(leaf) if is_known else leaf
+    def converted(leaf):
+        is_concrete = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer)
+        return np.asarray(leaf) if is_concrete else leaf
 
-    return jax.tree.map(to_numpy, tree)
+    return jax.tree.map(converted, tree)
 
 
 def stop_gradient(tree) -> Any:
-    """The same numbers, of which derivatives are zero."""
+    """Tree of the same numbers with zero derivatives."""
     return jax.lax.stop_gradient(tree) if any_jax(tree) else tree
 
 
 def zeros(shape: tuple[int, ...], like: Any) -> Any:
-    """Zeros, of JAX if any leaf of `like` is: the start of a loop that will hold such numbers."""
+    """Array of zeros, of JAX if any leaf of `like` is; to start a loop over such numbers."""
     return (jnp if any_jax(like) else np).zeros(shape)
 
 
 def scan(step: Callable, carry, inputs=None, length: int | None = None) -> Any:
-    """`jax.lax.scan`: a loop over the first axis of inputs; the final carry and stacked outputs.
+    """`jax.lax.scan`: final carry and stacked outputs of a loop over the first axis of inputs.
 
-    Known numbers become those of JAX where the function of a step has others among its own.
+    Concrete numbers are looped over in Python, unless `step` closes over arrays of JAX.
     """
     if any_jax(carry, inputs):
         return jax.lax.scan(step, carry, inputs, length)
@@ -271,14 +273,14 @@ def scan(step: Callable, carry, inputs=None, length: int | None = None) -> Any:
 
 
 def map_elements(function: Callable, inputs) -> Any:
-    """`jax.lax.map`: results of a function of each element along the first axis, stacked."""
+    """`jax.lax.map`: stacked results of a function for each element along the first axis."""
     return scan(lambda _, element: (None, function(element)), None, inputs)[1]
 
 
 def while_loop(condition: Callable, step: Callable, carry) -> Any:
-    """`jax.lax.while_loop`."""
+    """`jax.lax.while_loop`; concrete numbers are looped over in Python."""
     start, count = carry, 0
-    # Numbers that are known at the start and after one step stay known.
+    # Numbers that are concrete at the start and after one step stay concrete.
     while count > 1 or not any_jax(carry):
         if is_jax(going_on := condition(carry)):
             break
@@ -289,14 +291,14 @@ def while_loop(condition: Callable, step: Callable, carry) -> Any:
 
 
 def cond(predicate, if_true: Callable, if_false: Callable, *operands) -> Any:
-    """`jax.lax.cond`; only one branch is computed where the predicate is known."""
+    """`jax.lax.cond`; with a concrete predicate only its branch is called."""
     if is_jax(predicate):
         return jax.lax.cond(predicate, if_true, if_false, *operands)
     return if_true(*operands) if predicate else if_false(*operands)
 
 
 class custom_jvp:
-    """`jax.custom_jvp` of a function that known numbers call as it stands."""
+    """`jax.custom_jvp` of a function; concrete numbers call the function itself."""
 
     def __init__(self, function: Callable):
         self.function, self.traced = function, jax.custom_jvp(function)
@@ -311,7 +313,7 @@ class custom_jvp:
 
 
 def not_differentiated(value: Any, reason: str) -> Any:
-    """The value. Raises ValueError, with a reason, if it is differentiated."""
+    """Value that raises ValueError, with a reason, where it is differentiated."""
     if not is_jax(value):
         return value
 
@@ -328,12 +330,12 @@ def not_differentiated(value: Any, reason: str) -> Any:
 
 
 def fori_loop(start: int, end: int, step: Callable, carry) -> Any:
-    """`jax.lax.fori_loop`."""
+    """`jax.lax.fori_loop`; concrete numbers are looped over in Python."""
     return scan(lambda carry, i: (step(i, carry), None), carry, np.arange(start, end))[0]
 
 
 def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
-    """`jax.vmap`; a loop for known arguments, so for few elements; see also `vectorised`."""
+    """`jax.vmap`; concrete arguments are looped over in Python (for many see `vectorised`)."""
 
     def mapped(*args):
         if any_jax(args):
@@ -351,7 +353,7 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
         for i in range(size):
             element = structure.unflatten([_at(leaf, axis, i) for leaf, axis in leaves])
             result, result_structure = jax.tree.flatten(function(*element))
-            if i == 0 and any(map(is_jax, result)):  # from others than its arguments
+            if i == 0 and any(map(is_jax, result)):  # `function` closes over arrays of JAX
                 return jax.vmap(function, in_axes, out_axes)(*args)
             results.append(result)
         parts = zip(*results, strict=True)
@@ -361,14 +363,14 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
 
 
 def _at(leaf, axis, i):
-    """Entry of a leaf at an index along an axis; all of one that has none."""
+    """Entry of a leaf at an index along an axis; the whole leaf if the axis is None."""
     if axis is None:
         return leaf
     return leaf[..., i] if axis == -1 else np.take(leaf, i, axis)
 
 
 def _stack(parts, axis):
-    """`numpy.stack`, which for one part takes ten times as long as an index."""
+    """`numpy.stack`, with an index for a single part, which is ten times as fast."""
     if len(parts) == 1 and axis == -1:
         return np.asarray(parts[0])[..., None]
     return np.stack(parts, axis)
@@ -393,7 +395,7 @@ def solve(matrix, right) -> Any:
 
 
 def solve_conditioned(matrix, right) -> Any:
-    """`solve` of many well-conditioned systems; where any number is traced, by their inverses."""
+    """`solve` of many well-conditioned systems; by their inverses where any number is traced."""
     if is_jax(matrix):
         return lapack.inverses(matrix) @ right
     if is_jax(right):
@@ -402,7 +404,7 @@ def solve_conditioned(matrix, right) -> Any:
 
 
 def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> Any:
-    """Solution of a triangular system, or of that with the transposed matrix."""
+    """Solution of a triangular system, or with `transposed` of that with the transposed matrix."""
     if is_jax(matrix) or is_jax(right):
         return lapack.solve_triangular(matrix, right, lower, transposed)
     if not right.size:
@@ -419,7 +421,7 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
 
 
 def _solve_by_halves(matrix, right, lower: bool):
-    """`solve_triangular` of known columns: 528 rows in half the time of a general system."""
+    """`solve_triangular` in NumPy: 528 rows take half the time of a general system."""
     rows = len(matrix)
     if rows <= MAX_TRIANGLE_ROWS:
         # Reversed, a lower triangle is an upper one, of which elimination changes nothing.
@@ -456,7 +458,7 @@ def cholesky(matrix) -> Any:
 def ravel_pytree(tree) -> tuple[Any, Callable]:
     """`jax.flatten_util.ravel_pytree`: a tree as one vector, and the function that unpacks it.
 
-    The latter also unpacks columns (entry, column), as leaves with a last axis.
+    The function also unpacks columns (entry, column), as leaves with a last axis.
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [leaf if is_jax(leaf) else np.asarray(leaf) for leaf in leaves]
@@ -486,7 +488,7 @@ def block_diag(*blocks) -> Any:
 
 
 def slice_in_dim(array, start: int | None, end: int | None, axis: int) -> Any:
-    """Slice along one axis; XLA compiles it several times as fast as an index of JAX."""
+    """Slice along one axis, which XLA compiles several times as fast as an index of JAX."""
     if isinstance(array, jax.Array):
         return jax.lax.slice_in_dim(array, start, end, axis=axis)
     return array[(slice(None),) * (axis % array.ndim) + (slice(start, end),)]
@@ -501,13 +503,13 @@ def index_in_dim(array, index, axis: int = 0, keepdims: bool = True) -> Any:
 
 
 def collapse(array, start: int, end: int) -> Any:
-    """The array with the axes from start until before end made one."""
+    """Array with the axes from `start` to before `end` merged into one."""
     shape = array.shape
     return array.reshape(*shape[:start], math.prod(shape[start:end]), *shape[end:])
 
 
 def searchsorted(ascending, values) -> Any:
-    """Number of the ascending entries that are not above each value; for few entries."""
+    """Number of ascending entries less than or equal to each value; for few entries."""
     if is_jax(ascending) or is_jax(values):
         return jnp.searchsorted(ascending, values, side="right", method="compare_all")
     return np.searchsorted(ascending, values, side="right")

@@ -141,7 +141,7 @@ class Writer:
         return [value_of(atom) for atom in jaxpr.outvars]
 
     def constant(self, array: np.ndarray) -> CArray:
-        """An array of known numbers."""
+        """Array of constant numbers."""
         value = CArray(kind_of(array), array.shape, self.new_name(), False)
         numbers = ", ".join(map(number_text, array.ravel().tolist())) or "0"
         self.line(f"static const {value.type} {value.name}[] = {{{numbers}}};")

@@ -30,7 +30,7 @@ PARALLEL_COMPILATION = {"xla_cpu_parallel_codegen_split_count": 1}
 # For programs whose run time is less than the compile time that optimisation costs.
 LOW_OPTIMISATION = {"xla_backend_optimization_level": 0}
 
-KEPT_PROGRAMS = 64  # of functions of traced numbers
+KEPT_PROGRAMS = 64  # kept programs of functions of traced numbers
 MAX_SLOPES = 2**24  # entries of all derivatives that are computed with the values
 
 P = ParamSpec("P")
@@ -54,7 +54,7 @@ class _StaticOutputs(eqx.Module):
 
 
 class Compiled(Generic[P, R]):
-    """A function with one program for each structure of its arguments; see `compiled`."""
+    """Function with a compiled program for each structure of its arguments; see `compiled`."""
 
     def __init__(self, function: Callable[P, R], settings: dict[str, bool | int]):
         functools.update_wrapper(self, function)
@@ -66,16 +66,16 @@ class Compiled(Generic[P, R]):
             return arrays, _StaticOutputs(tuple(rest))
 
         self._program = program
-        # Within another program, which has its own compiler options.
+        # For calls within another program, which has its own compiler options.
         self._jitted_inner = jax.jit(_renamed(program, function.__name__), static_argnums=1)
 
     @functools.cached_property
     def jitted(self):  # at the first call, since `xla_options` starts XLA
-        """The function of (arrays, static arguments) under `jax.jit`."""
+        """`jax.jit` of the function of (arrays, static arguments)."""
         return self.jitted_as(self.__name__)
 
     def jitted_as(self, name: str):
-        """`jitted`, with another name of the program."""
+        """`jitted` with another name of the program."""
         options = xla_options(**self.settings)
         return jax.jit(_renamed(self._program, name), static_argnums=1, compiler_options=options)
 
@@ -129,7 +129,7 @@ class Compiled(Generic[P, R]):
         entry.compiled = True
 
     def template(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Outputs of a call, with zeros for its numbers, without compiling."""
+        """Outputs of a call with zeros for numbers, found without compilation."""
         arrays, *rest = _partition((args, kwargs))
         entry = self._entry(arrays, rest)
         entry.outputs = entry.outputs or entry.jitted.eval_shape(arrays, tuple(rest))
@@ -197,25 +197,24 @@ def compiled(function: Any = None, **settings: bool | int) -> Any:
 
 
 def compiled_if_traced(function: Callable[P, R]) -> Callable[P, R]:
-    """Compute a function of known numbers at once; compile what traced ones touch of it.
+    """Decorator: compute in NumPy from concrete numbers; compile what depends on traced ones.
 
-    The function and all that it calls use `jaxbeam.runtime.arrays`. Known arrays of JAX are handed
-    on as arrays of NumPy. Where some numbers are traced, whatever depends on none of them is
-    computed in NumPy, so that the program holds the rest only; results that depend on none of them
-    are arrays of NumPy.
+    The function and all that it calls use `jaxbeam.runtime.arrays`. Concrete arrays of JAX are
+    passed as arrays of NumPy. Where some numbers are traced, only the operations that depend on
+    them become a program; results that depend on none of them are arrays of NumPy.
     """
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _partition((args, kwargs))
         traced = [i for i, leaf in enumerate(arrays) if isinstance(leaf, jax.core.Tracer)]
-        known = [
+        concrete = [
             None if leaf is None or i in traced else np.asarray(leaf)
             for i, leaf in enumerate(arrays)
         ]
 
         def compute(*numbers):
-            leaves = list(known)
+            leaves = list(concrete)
             for i, number in zip(traced, numbers, strict=True):
                 leaves[i] = number
             args, kwargs = _combine(leaves, *rest)
@@ -230,16 +229,16 @@ def compiled_if_traced(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _compile_traced(compute: Callable, numbers: list, name: str) -> Any:
-    """Value of a function of traced numbers by a program; what they do not touch stays as it is."""
+    """Value of a function of traced numbers; operations that depend on them become a program."""
     outputs: Any = None
 
-    def touched(*numbers):
+    def traced_outputs(*numbers):
         nonlocal outputs
         leaves, structure = jax.tree.flatten(compute(*numbers))
         outputs = [None if isinstance(leaf, jax.Array) else leaf for leaf in leaves], structure
         return [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
 
-    closed = jax.make_jaxpr(touched)(*numbers)
+    closed = jax.make_jaxpr(traced_outputs)(*numbers)
     equations = _Equations(closed.jaxpr)
     outs = [out.aval for out in closed.jaxpr.outvars]
     entries = sum(out.size for out in outs) * sum(map(np.size, numbers))
@@ -254,7 +253,7 @@ def _compile_traced(compute: Callable, numbers: list, name: str) -> Any:
 
 
 def _differentiated(numbers: list) -> bool:
-    """Whether real numbers are differentiated outside of programs, so that they are known."""
+    """Whether numbers are real, and differentiated outside of `jit`, so that they are concrete."""
     try:
         for number in numbers:
             jax.extend.core.concrete_or_error(None, number)
@@ -264,7 +263,7 @@ def _differentiated(numbers: list) -> bool:
 
 
 def _mapped(equations: "_Equations", constants, name: str, numbers: list) -> list:
-    """Values of a program; under `vmap` outside of programs those of a batch, compiled as such."""
+    """Values of a program; under `vmap` outside of `jit` a program is compiled for the batch."""
 
     def inside(numbers):
         return _program_of(equations, name, 0, False)(constants, numbers)
@@ -283,10 +282,11 @@ def _mapped(equations: "_Equations", constants, name: str, numbers: list) -> lis
 
 
 def _by_slopes(equations: "_Equations", constants, name: str, order: int, numbers: list) -> list:
-    """Values of a program, whose derivatives are computed with them, in forward mode.
+    """Values of a program with a rule of derivatives: values and slopes by forward mode.
 
-    One program each for values and slopes, with options for compilation that none has inside
-    `jax.grad`, and none for the reverse pass. With an `order` above zero, derivatives of values.
+    Values and slopes have a program each, with compiler options, which a program inside `jax.grad`
+    cannot have, and none for the reverse pass. An `order` above zero is that of the derivatives of
+    the values.
     """
 
     @jax.custom_jvp
@@ -313,7 +313,7 @@ def _by_slopes(equations: "_Equations", constants, name: str, order: int, number
 
 @jax.jit
 def _along(slopes, tangents):
-    """Derivatives of values along tangents of numbers, from slopes by one number after another."""
+    """Derivatives of values along tangents, from `slopes` (number, ...) by the flat numbers."""
     vector = jnp.concatenate([jnp.ravel(part) for part in tangents])
     return [jnp.tensordot(vector, slope, 1) for slope in slopes]
 
@@ -330,12 +330,11 @@ def _program_of(
     with_options: bool,
     mapped: tuple[int | None, ...] = (),
 ) -> Callable:
-    """Function of constants and numbers, from its equations.
+    """Function of constants and numbers under `jax.jit`, from its equations.
 
-    With an `order` above zero its last output are the slopes of the other real ones, the first
-    axis that of the numbers. `mapped` are the axes of the numbers of a batch, if they are of one.
-    Part of another program, or `with_options` for compilation one of its own, which is compiled
-    once that has become cheaper than to compute it in NumPy.
+    With an `order` above zero the last output are the slopes of the real outputs, (number, ...).
+    `mapped` are the batch axes of the numbers, empty without a batch. `with_options` it is a
+    program of its own with compiler options, compiled when this becomes cheaper than NumPy.
     """
 
     def program(constants, numbers):
@@ -352,7 +351,7 @@ def _program_of(
 
 
 class _InterpretedFirst:
-    """A function under `jax.jit`, computed in NumPy as long as that takes less time altogether."""
+    """Function under `jax.jit` that is computed in NumPy until compilation would be cheaper."""
 
     def __init__(self, jitted):
         self.jitted, self.spent, self.traced, self.program = jitted, 0.0, None, None
@@ -372,7 +371,7 @@ class _InterpretedFirst:
 
 
 def _with_slopes(values: Callable) -> Callable:
-    """A function of numbers that also returns the slopes of its real values."""
+    """Function of numbers that also returns the slopes of its real values."""
 
     def both(numbers):
         vector, unravel = jax.flatten_util.ravel_pytree(numbers)
@@ -392,7 +391,7 @@ def _with_slopes(values: Callable) -> Callable:
 
 
 class _Equations:
-    """Equations of a program, which are equal to others that read the same."""
+    """Equations of a program, equal to others with the same text."""
 
     def __init__(self, jaxpr):
         self.jaxpr, self.text = jaxpr, str(jaxpr)
@@ -405,14 +404,14 @@ class _Equations:
 
 
 def _renamed(program, name: str):
-    """A function under another name, which is that of its program in profiles and logs."""
+    """Function under another name, which its program has in profiles and logs."""
     program = functools.partial(program)
     program.__name__ = program.__qualname__ = name  # type: ignore[attr-defined]
     return program
 
 
 def _partition(tree) -> tuple[list, tuple, Any]:
-    """Arrays among the leaves, other leaves, each with None for the others, and the structure."""
+    """Leaves that are arrays, other leaves, and structure; None in place of leaves left out."""
     leaves, structure = jax.tree.flatten(tree)
     array_mask = [eqx.is_array(leaf) for leaf in leaves]
     arrays = [leaf if is_array else None for leaf, is_array in zip(leaves, array_mask, strict=True)]
@@ -445,7 +444,7 @@ _zero = jax.jit(lambda: 0.0)  # a seventh of the time that jnp.zeros takes
 
 @functools.cache
 def _supported_options() -> dict[str, bool | int]:
-    """XLA_OPTIONS that this version of XLA has; they come and go."""
+    """XLA_OPTIONS that this version of XLA supports."""
 
     def supports(settings):
         try:

@@ -164,13 +164,13 @@ def _as_it_is(equation) -> Callable:
 
     def call(*arrays):
         found = primitive.bind(*map(jax.numpy.asarray, arrays), **params)
-        return jax.tree.map(_known, found)
+        return jax.tree.map(_to_numpy, found)
 
     return call
 
 
-def _known(value):
-    """An array of NumPy, of numbers that it has."""
+def _to_numpy(value):
+    """Array of NumPy, except of a type that NumPy lacks, as a key of random numbers."""
     return value if jnp.issubdtype(value.dtype, jax.dtypes.extended) else np.asarray(value)
 
 

@@ -1,4 +1,4 @@
-"""Memory that is free, the part that blocks take, and rare collections of garbage."""
+"""Free memory, memory of the blocks of a computation, and rare garbage collection."""
 
 import contextlib
 import gc
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 DEFAULT_PART = 4  # blocks take a quarter of what is free: other programs need some, too
-UNKNOWN = 2 * 2**30  # bytes, of a machine that does not say what is free
+UNKNOWN = 2 * 2**30  # bytes, assumed on a machine that does not report free memory
 UNITS = {"": 1.0, "B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 UNITS |= {"KiB": 2.0**10, "MiB": 2.0**20, "GiB": 2.0**30, "TiB": 2.0**40}
 GROUPS = Path("/sys/fs/cgroup")  # of control groups, by which containers limit memory
@@ -47,7 +47,7 @@ def size_text(size: float) -> str:
 
 
 def _of_machine() -> float | None:
-    """Memory that programs can take without swapping; half of all where only that is known."""
+    """Memory (bytes) available without swapping; half of the total where only that is known."""
     try:
         text = Path("/proc/meminfo").read_text()
         return 1024.0 * int(re.findall(r"^MemAvailable:\s*(\d+)", text, re.M)[0])
@@ -60,7 +60,7 @@ def _of_machine() -> float | None:
 
 
 def _of_container() -> float | None:
-    """What the control group of this process leaves; pages of files that it caches are free."""
+    """Memory (bytes) left by the control group of this process; cached files count as free."""
     for most, used, cached in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
@@ -76,7 +76,7 @@ def _of_container() -> float | None:
 
 
 def _of_process() -> float | None:
-    """What the limit of the address space (`ulimit -v`) leaves."""
+    """Memory (bytes) left by the limit of the address space (`ulimit -v`)."""
     try:
         import resource
 
@@ -91,7 +91,7 @@ def _of_process() -> float | None:
 
 @contextlib.contextmanager
 def rare_collections() -> Iterator[None]:
-    """A context in which Python seldom looks for cyclic garbage.
+    """Context in which Python's garbage collector runs rarely.
 
     Imports and tracing make a million objects and hardly any garbage: the first sweep of a process
     takes 0.15 s less of 1.4 s.
@@ -101,5 +101,5 @@ def rare_collections() -> Iterator[None]:
     try:
         yield
     finally:
-        if former != RARELY:  # else another thread, or the command line, has set and restores it
+        if former != RARELY:  # otherwise another thread, or the command line, restores it
             gc.set_threshold(*former)

@@ -98,9 +98,9 @@ class Library(NamedTuple):
 
     @contextlib.contextmanager
     def built_meanwhile(self) -> Iterator[None]:
-        """A context in which the library is compiled, if it can be, beside what is done there.
+        """Context in which the library is compiled in another thread, if it can be.
 
-        At its end the library is `available`, unless compiling it failed: that changes nothing.
+        At its end the library is `available`, unless compilation failed, which raises nothing.
         """
         if not self.can_be_built():
             yield

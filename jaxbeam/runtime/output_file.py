@@ -101,7 +101,7 @@ class InUseError(OSError):
 
 @contextlib.contextmanager
 def writer_lock(path: Path) -> Iterator[None]:
-    """Hold the lock of a path, which need not exist, in a file `.NAME.lock` beside it.
+    """Hold the lock of a path, which need not exist, in a file `.NAME.lock` in its folder.
 
     Raises InUseError if another process (or thread) holds it, OSError if the folder cannot be
     written to.
@@ -180,7 +180,7 @@ def _content_and_silence(lock: Path, now: float) -> tuple[bytes | None, float]:
 
 
 def _holder(held: bytes) -> dict[str, Any]:
-    """What a lock says of its process; empty if it is damaged."""
+    """Content of a lock, which identifies its process; empty if it is damaged."""
     try:
         content = json.loads(held)
         return content if isinstance(content, dict) else {}
@@ -206,7 +206,7 @@ def _give_signs_of_life(lock: Path, ended: threading.Event) -> None:
 
 
 def _this_process() -> dict[str, Any]:
-    """What tells this holding of a lock from all others."""
+    """Content of a lock of this process, unique for each time that it is held."""
     return {
         "host": platform.node(),
         "process": os.getpid(),
@@ -218,9 +218,9 @@ def _this_process() -> dict[str, Any]:
 
 
 def _machine() -> str | None:
-    """What tells apart machines, their starts, and containers; None if process times are unknown.
+    """Identifier of machine, boot and container; None if process times are unknown.
 
-    Host names do not: two machines may share one.
+    A host name is not enough: two machines may have the same.
     """
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()

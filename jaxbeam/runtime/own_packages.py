@@ -1,7 +1,7 @@
-"""The packages beside jaxbeam, `tuning` and `experiments`, found by location.
+"""Import of `tuning` and `experiments`, the packages next to jaxbeam, from its own folder.
 
-Their names are everybody's words: a file `tuning.py` in the working folder is found first wherever
-Python looks there, as in a notebook, with `python -m` or with PYTHONPATH.
+Their names are common words: a file `tuning.py` in the working folder would be found first in a
+notebook, with `python -m` or with PYTHONPATH.
 """
 
 import importlib
@@ -14,8 +14,8 @@ FOLDER = Path(__file__).resolve().parent.parent.parent
 NAMES = ("tuning", "experiments")
 
 
-class _Beside(importlib.abc.MetaPathFinder):
-    """Finds the two packages where jaxbeam is, and nothing else."""
+class _SiblingFinder(importlib.abc.MetaPathFinder):
+    """Finder of the two packages in the folder of jaxbeam, and of no others."""
 
     def find_spec(self, fullname, path, target=None):
         if fullname in NAMES:
@@ -26,30 +26,30 @@ class _Beside(importlib.abc.MetaPathFinder):
         return None
 
 
-_BESIDE = _Beside()
+_SIBLING_FINDER = _SiblingFinder()
 
 
-def find_beside() -> None:
-    """From now on `import tuning` and `import experiments` take the packages beside jaxbeam.
+def find_siblings() -> None:
+    """Let `import tuning` and `import experiments` find the packages next to jaxbeam from now on.
 
-    For processes that run programs of jaxbeam alone.
+    For processes that run programs of jaxbeam only.
     """
-    if _BESIDE not in sys.meta_path:
-        sys.meta_path.insert(0, _BESIDE)
+    if _SIBLING_FINDER not in sys.meta_path:
+        sys.meta_path.insert(0, _SIBLING_FINDER)
 
 
 def own_package(name: str) -> ModuleType:
-    """The package of a name beside jaxbeam, whatever else the folder has of that name.
+    """Package `tuning` or `experiments` next to jaxbeam, whatever the working folder contains.
 
     Raises ImportError, which names its file, if another module of the name has been imported.
     """
     module = sys.modules.get(name)
     if module is None:
-        sys.meta_path.insert(0, _BESIDE)
+        sys.meta_path.insert(0, _SIBLING_FINDER)
         try:
             module = importlib.import_module(name)
         finally:
-            sys.meta_path.remove(_BESIDE)
+            sys.meta_path.remove(_SIBLING_FINDER)
     file = getattr(module, "__file__", None) or "a namespace"
     if Path(file).resolve() != FOLDER / name / "__init__.py":
         raise ImportError(

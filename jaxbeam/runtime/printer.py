@@ -77,7 +77,7 @@ def _unbroken(unit: re.Match) -> str:
 def _groups(
     natural: list[int], least: list[int], limit: int
 ) -> Iterator[tuple[list[int], list[int]]]:
-    """Columns that fit beside each other, the first column in each group, and their widths."""
+    """Groups of columns that fit next to each other, each with the first column, and widths."""
     if sum(natural) + GAP * (len(natural) - 1) <= limit:
         yield list(range(len(natural))), natural
         return
@@ -192,7 +192,7 @@ class TableViews:
 
 
 def _cell(entry: Any) -> str:
-    """Text of an entry of a column: six digits of a number, nothing for what is not known."""
+    """Text of an entry of a column: six digits of a number, nothing for NaN."""
     if isinstance(entry, str):
         return entry
     return "" if entry != entry else f"{entry:.6g}"

@@ -1,4 +1,4 @@
-"""Functions whose latest results are kept, by the contents of the tree that they take."""
+"""Caches of the latest results of functions, by the contents of their arguments."""
 
 import collections
 import dataclasses
@@ -15,7 +15,7 @@ KEPT_RESULTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class _Content:
-    """Structure, shapes and numbers of a tree, which decide whether two are equal."""
+    """Key of the cache: structure, shapes and numbers of a tree."""
 
     structure: Any
     numbers: tuple[tuple[tuple[int, ...], bytes], ...]
@@ -23,10 +23,10 @@ class _Content:
 
 
 def remembered(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A function of one tree of known numbers, whose latest results are not computed again.
+    """Decorator: cache the latest results of a function of one tree of concrete numbers.
 
-    They are shared, so not to be changed. Sweeps that are repeated for other loads take 3 ms less
-    of 24 (4096 crossings, three modes, in C).
+    Results must not be changed, as callers get the same object. Sweeps that are repeated for other
+    loads take 3 ms less of 24 (4096 crossings, three modes, in C).
     """
 
     @functools.lru_cache(maxsize=KEPT_RESULTS)
@@ -44,9 +44,9 @@ def remembered(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def remembered_within(size: float) -> Callable[[Callable], Callable]:
-    """A function whose latest results are kept, by its arguments, within a size (bytes) together.
+    """Decorator: cache the latest results of a function, up to a total `size` (bytes).
 
-    The arguments are hashable, the results trees of arrays, which are shared.
+    Arguments are hashable, results are trees of arrays, which must not be changed.
     """
 
     def decorate(function: Callable) -> Callable:

@@ -1,9 +1,9 @@
-"""Functions of known arrays over a first axis, in NumPy: as `jax.vmap`, without tracing.
+"""Functions vectorised over the first axis of NumPy arrays: as `jax.vmap`, without tracing.
 
 Within a vectorised function an array that varies is a `VectorisedArray`, whose first axis is
 hidden. It goes through the functions of NumPy by their protocols, each called once for all
-elements. Sweeps compute the times of 64 paths so in 1 ms, one after the other in 29 ms; and what
-the C integrator needs to know, without the 0.4 s of tracing and compiling the same.
+elements. Sweeps compute the times of 64 paths so in 1 ms, instead of 29 ms one after the other; and
+the inputs of the C integrator without 0.4 s of tracing and compilation.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 
 class NotVectorisedError(Exception):
-    """A function asks for a single number of a `VectorisedArray`, or for what it does not do."""
+    """Error of a function that needs a single number, or an operation a `VectorisedArray` lacks."""
 
 
 def vectorised(function: Callable, out_axes: int = 0) -> Callable:
-    """A function of trees of known arrays, over the first axis of all of them.
+    """Function of trees of NumPy arrays, applied along the first axis of all of them.
 
-    `out_axes` is the axis of results. Raises NotVectorisedError where the function cannot be
-    vectorised: where it decides by the numbers, or calls what `_FUNCTIONS` lacks.
+    `out_axes` is the axis of the elements in results. Raises NotVectorisedError where the function
+    branches on numbers, or calls a function of NumPy that `_FUNCTIONS` lacks.
     """
 
     def mapped(*args):
@@ -37,20 +37,20 @@ def vectorised(function: Callable, out_axes: int = 0) -> Callable:
 
 
 def _call(function: Callable, args: tuple) -> Any:
-    """Value of a function of what varies. Raises NotVectorisedError as `vectorised` does."""
+    """Value of a function of `VectorisedArray`s. Raises NotVectorisedError as `vectorised` does."""
     try:
         return function(*args)
-    except ValueError as error:  # of NumPy, where it sets an entry to what varies
+    except ValueError as error:  # of NumPy, where an entry is set to a `VectorisedArray`
         if isinstance(error.__cause__, NotVectorisedError):
             raise error.__cause__ from None
         raise
 
 
 class VectorisedArray(NDArrayOperatorsMixin):
-    """Array of which each element along a hidden first axis of `values` is one.
+    """Array with a hidden first axis: an element of `values` along it has the visible shape.
 
-    In a function that is vectorised within another, the values are such an array themselves; the
-    `level` is the deeper the larger.
+    In a function that is vectorised within another, the values are a `VectorisedArray` themselves;
+    `level` counts the nesting.
     """
 
     __slots__ = ("level", "values")
@@ -137,12 +137,12 @@ class VectorisedArray(NDArrayOperatorsMixin):
 
 
 def _level(part) -> int:
-    """Level of an array, 0 of one of NumPy."""
+    """Level of an array; 0 for an array of NumPy."""
     return part.level if isinstance(part, VectorisedArray) else 0
 
 
 def _ndim(part) -> int:
-    """Number of axes, sooner than by `numpy.ndim`, which would come back to this module."""
+    """Number of axes; faster than `numpy.ndim`, which would call this module again."""
     return part.ndim if hasattr(part, "ndim") else np.ndim(part)
 
 
@@ -151,7 +151,7 @@ def _moved(array, source: int, target: int):
 
 
 def _values(part, level: int, size: int):
-    """Array with the axis of a level as its first one."""
+    """Array with the hidden axis of a level as its first one."""
     if _level(part) == level:
         return part.values
     part = part if isinstance(part, VectorisedArray) else np.asarray(part)
@@ -165,7 +165,7 @@ def _deepest(parts) -> tuple[int, int]:
 
 
 def _elementwise(function, *parts):
-    """Result of a function of broadcast entries."""
+    """Result of an elementwise function of broadcast arrays."""
     level = ndim = 0
     for part in parts:
         if isinstance(part, VectorisedArray):
@@ -212,7 +212,7 @@ def _joined(function):
 def _along(function, default: int | None, *options: str):
     """Rule of a function along an axis, or along all of them if it is None.
 
-    `options` are those that it takes beside.
+    `options` are further arguments that it takes.
     """
 
     def rule(array, axis=default, **given):
@@ -286,7 +286,7 @@ def _result_type(*parts):
 
 
 def set_at(array, index, value):
-    """Copy of an array with the entries at a known index replaced, where one varies."""
+    """Copy of an array with the entries at an index replaced; array or value may be vectorised."""
     level, size = _deepest((array, value))
     index = index if isinstance(index, tuple) else (index,)
     given, kind = _values(value, level, size), np.result_type(array, value)

@@ -33,7 +33,7 @@ class NoError(Exception):
 
 
 class Missing:
-    """What only JAX has: it can be named and made a decorator, but not computed."""
+    """Stand-in for a function that only JAX has: it can decorate, but not compute."""
 
     def __init__(self, name: str):
         self.__name__ = self.__qualname__ = name
@@ -148,7 +148,7 @@ def tree_map(function: Callable, tree: Any, *others: Any, is_leaf: Callable | No
 
 
 def _below(structure: Structure, tree: Any) -> list[Any]:
-    """What stands in a tree where another has its leaves."""
+    """Subtrees of a tree at the places of the leaves of a structure."""
     if structure.kind is NoArray:
         return [tree]
     found = _parts(tree)
@@ -305,7 +305,7 @@ class _Module(types.ModuleType):
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Says what is missing where another module of JAX is imported."""
+    """Finder that raises an error with the missing package where another module is imported."""
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
         """Raises ImportError for a module of JAX, equinox or optax."""

@@ -13,7 +13,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.along_beam import moving_positions, refined, sections
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, any_traced, known, take, xp
+from jaxbeam.runtime.arrays import Array, any_traced, take, to_numpy, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.printer import TableViews
@@ -109,7 +109,7 @@ def record_envelope(
     """
     parameters = fibre_distance, section_modulus
     if not any_traced(case, modes, motion, times):
-        case, modes, motion, times = known((case, modes, motion, times))
+        case, modes, motion, times = to_numpy((case, modes, motion, times))
 
     def at(x):
         return _envelope_at(case, modes, motion, times, x, quantity, coincident, parameters)

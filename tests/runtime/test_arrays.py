@@ -90,7 +90,7 @@ FUNCTIONS = {
     "cholesky": (arrays.cholesky, FACTOR @ FACTOR.T),
     "cholesky, not positive definite": (arrays.cholesky, np.diag([1.0, -1.0])),
     "expm": (expm, FACTOR / 7 - np.eye(4)),
-    "known": (lambda a: arrays.known({"a": a, "b": (1, VECTOR)}), MATRIX),
+    "to_numpy": (lambda a: arrays.to_numpy({"a": a, "b": (1, VECTOR)}), MATRIX),
     "block_diag": (lambda a, b: arrays.block_diag(a, b, np.eye(2)), MATRIX, FACTOR),
     "slice_in_dim": (lambda a: arrays.slice_in_dim(a, 1, None, axis=-1), MATRIX),
     "index_in_dim": (lambda a, i: arrays.index_in_dim(a, i, axis=1), MATRIX, 2),
@@ -126,7 +126,7 @@ def test_known_and_traced_arrays_give_the_same(name):
 
 
 def test_every_function_of_the_module_has_its_case():
-    others = {"is_jax", "is_known", "any_jax", "any_traced", "custom_jvp", "Array", "Number"}
+    others = {"is_jax", "is_numpy", "any_jax", "any_traced", "custom_jvp", "Array", "Number"}
     functions = {
         name
         for name, value in vars(arrays).items()
@@ -274,7 +274,7 @@ def test_products_of_any_subscripts(product):
 
 
 def test_known_numbers_of_jax_become_those_of_numpy():
-    tree = arrays.known({"a": jnp.asarray(VECTOR), "b": "words"})
+    tree = arrays.to_numpy({"a": jnp.asarray(VECTOR), "b": "words"})
     assert isinstance(tree["a"], np.ndarray)
     np.testing.assert_array_equal(tree["a"], VECTOR)
     assert tree["b"] == "words"

@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import addresses, concrete_case, replace
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime import interpreter
-from jaxbeam.runtime.arrays import add_at, is_jax, is_known, set_at, take, vmap, xp
+from jaxbeam.runtime.arrays import add_at, is_jax, is_numpy, set_at, take, vmap, xp
 from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
 from jaxbeam.runtime.lapack import _solve as solve
 from jaxbeam.runtime.vectorised import NotVectorisedError, VectorisedArray, vectorised
@@ -371,8 +371,8 @@ def test_what_cannot_be_vectorised_says_so(function):
 
 def test_what_varies_is_no_known_number():
     varying = VectorisedArray(np.ones(2))
-    assert not is_known(varying) and not is_jax(varying)
-    assert is_known(np.ones(2)) and not is_known(jax.numpy.ones(2))
+    assert not is_numpy(varying) and not is_jax(varying)
+    assert is_numpy(np.ones(2)) and not is_numpy(jax.numpy.ones(2))
     assert not hasattr(varying, "__jax_array__")
 
 

@@ -24,7 +24,7 @@ from jaxbeam.case.profiles.shapes import (
     Heights,
     smooth_step,
 )
-from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_known, scan, xp, zeros
+from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_numpy, scan, xp, zeros
 from jaxbeam.runtime.module import Module
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
@@ -92,7 +92,7 @@ def sum_of_cosines(
     """
     waves = (wavenumbers, amplitudes, phases)
     count = wavenumbers.shape[0]
-    if x.size * count >= LEAST_INTERPOLATED and all(map(is_known, (x, *waves))):
+    if x.size * count >= LEAST_INTERPOLATED and all(map(is_numpy, (x, *waves))):
         half = 0.5 * PANEL_PHASE / (2 * np.pi * np.max(np.abs(wavenumbers)))
         with np.errstate(all="ignore"):  # of positions that are not finite
             panels = np.ptp(x) / (2 * half)
@@ -170,7 +170,7 @@ def _switched(x, switch_on, heights) -> Heights:
     Concrete heights may have a last axis of runs.
     """
     length = switch_on[1] - switch_on[0]
-    if is_known(x) and is_known(switch_on) and all(map(is_known, heights)):
+    if is_numpy(x) and is_numpy(switch_on) and all(map(is_numpy, heights)):
         before = (x - switch_on[0]) / length < 1.0  # elsewhere the factor is 1
         if x.ndim and not before.all():
             own = x[before].reshape(-1, *(1,) * (heights[0].ndim - x.ndim))

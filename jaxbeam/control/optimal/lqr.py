@@ -46,7 +46,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import boundary_layer
 from jaxbeam.numerics.gain_table import GainTable
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime.arrays import Array, Number, known, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
@@ -295,7 +295,7 @@ class LQR(AbstractStateController):
 
     def gain_table(self, plant: Plant) -> GainTable:
         """Gains over the crossing for a plant: of its states, and of the weights fed forward."""
-        return known(_gain_table(self, plant))
+        return to_numpy(_gain_table(self, plant))
 
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
@@ -349,7 +349,7 @@ class LQR(AbstractStateController):
             source = self.load_identification.identifier(plant, design_plant)
 
         return ScheduledGainLaw(
-            known(_designs(self, plant, design_plant, speeds)),
+            to_numpy(_designs(self, plant, design_plant, speeds)),
             self.masses,
             speeds,
             plant.case.beam.length,
@@ -365,7 +365,7 @@ class LQR(AbstractStateController):
         if speeds is None:
             speeds = xp.abs(design_plant.case.loads[0].speed)[None]
 
-        designs = known(_designs(self, alone, alone, speeds))
+        designs = to_numpy(_designs(self, alone, alone, speeds))
         gravity = plant.case.run.gravity
         masses = xp.stack([xp.asarray(load.total_mass(gravity)) for load in plant.case.loads])
         return PositionGainLaw(designs, self.masses, speeds, masses, masses * gravity, plant.loads)
