@@ -34,7 +34,7 @@ TOLERANCES = {  # of these classes, relative
 # (R2); by season, of a day (I), of some days (II), of a year (III).
 PLANS = {"r1": 2.675, "r2": 2.36, "R1": 2.155, "R2": 2.0}
 ENVIRONMENTS = {"I": 1.0, "II": 1.05, "III": 1.1}
-INITIAL = 0.8  # share of the tolerances, for vehicles by which the lines were calibrated
+INITIAL = 0.8  # fraction of the tolerances, for vehicles by which the lines were calibrated
 LEAST_COUNT = 5  # of errors in a criterion that is classed
 
 
@@ -117,10 +117,10 @@ class Accuracy(TableViews):
 
 
 def relative_errors(pairs: Iterable[tuple[Axles, Axles]]) -> dict[str, Float[np.ndarray, " error"]]:
-    """Relative errors by criterion of weighed vehicles, each in a pair with the known one.
+    """Relative errors by criterion, from pairs of a weighed vehicle and its reference.
 
-    Groups are those of the known vehicle, less than 2.2 m apart. A vehicle that was weighed with
-    another number of axles has an error of the gross weight alone.
+    Groups are axles of the reference less than 2.2 m apart. A vehicle that was weighed with another
+    number of axles has an error of the gross weight only.
 
     >>> import jaxbeam as jb
     >>> import tuning

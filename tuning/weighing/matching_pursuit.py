@@ -32,7 +32,7 @@ from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 from tuning.weighing.unit_force import UnitForce
 
 SPEED_COUNT = 16  # candidates in each direction,
-VIBRATING_SPEED_COUNT = 64  # or so many, if a sensor feels the vibration: its phase tells the speed
+VIBRATING_SPEED_COUNT = 64  # if a sensor measures vibration, whose phase depends on the speed
 REFINED_COUNT = 4  # candidates of different speeds that are refined
 ENTRY_TIME_COUNT = 80  # candidates for each speed at least,
 ENTRIES_PER_PERIOD = 8  # and in a period of the first mode, if a sensor feels the vibration,
@@ -80,9 +80,9 @@ class MatchingPursuit:
     def find(self, count: int) -> MatchingPursuitResult:
         """The `count` loads that together explain the readings best.
 
-        Loads that are on the beam at once are hard to tell apart one by one, so the last two are
-        also searched as a pair, among all pairs of candidates. Masses are positive, so that a fit
-        can start from them.
+        Loads that are on the beam at once are hard to separate one by one, so the last two are also
+        searched as a pair, among all pairs of candidates. Masses are positive, so that a fit can
+        start from them.
         """
         load_parameters = self._find_loads(count)
         least = 1e-3 * max(np.max(load_parameters[:, 0]), 1e-12)
@@ -121,7 +121,7 @@ class MatchingPursuit:
     def _best_pair(self, residual: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "load 3"]:
         """The two loads that explain most of the residual, by least squares for all pairs.
 
-        Of many candidates those are paired that explain most of it alone.
+        Of many candidates only those are paired that explain most of the residual alone.
         """
         gains = self.candidate_readings @ residual.ravel() / self.candidate_norms
         chosen = np.sort(np.argsort(-gains, kind="stable")[:MAX_PAIRED])
@@ -192,8 +192,8 @@ def _centred(table: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "time
 class MosesFit:
     """Axle forces (N) with their covariance, at a geometry; residuals by sensor.
 
-    The covariance is that of `dynamic_forces`, for which the residuals are due to dynamic wheel
-    forces, `dynamic_share` of the static ones (standard deviation).
+    The covariance is that of `dynamic_errors`: residuals are attributed to dynamic wheel forces,
+    `dynamic_share` of the static ones (standard deviation).
     """
 
     geometry: AxleGeometry
@@ -230,7 +230,7 @@ def moses(
 ) -> MosesFit:
     """Axle forces by Moses' method from the readings (SI units) of a crossing.
 
-    The geometry is known, or was `found` in the same readings: its errors then are part of those of
+    The geometry is exact, or was `found` in the same readings, so that its errors add to those of
     the forces. Raises ValueError if the axles are on the beam at too few samples.
     """
     valid = np.ones(readings.shape, bool) if valid is None else valid
@@ -264,7 +264,7 @@ def moses(
 
 
 def _geometry_slopes(lines, geometry: AxleGeometry, times, forces):
-    """Derivatives (time, number, sensor) by speed, entry time and distances, by differences."""
+    """Derivatives (time, number, sensor) by speed, entry time and distances, as differences."""
     slopes = []
     numbers = np.array([geometry.speed, geometry.entry_time, *geometry.offsets[1:]])
     for i in range(numbers.size):

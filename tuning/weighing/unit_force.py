@@ -52,7 +52,7 @@ class UnitForce:
         self.length = float(concrete(case.beam.length))
         self.correction = static_correction(model, bare, bare.sensors, outputs)
         self.frequencies = np.asarray(model.modes.frequencies)
-        # In coordinates in which each state is on its own.
+        # In coordinates that decouple the states.
         self.poles, self.vectors = np.linalg.eig(model.A)
         self.inputs = np.linalg.solve(self.vectors, inputs[:, commands:])
         self.outputs, self.feedthrough = C @ self.vectors, D[:, commands:]
@@ -106,7 +106,7 @@ class UnitForce:
 
 
 def _signal(sensor: Sensor) -> Sensor:
-    """The sensor with its analogue filter and delay alone: what acts before its samples."""
+    """Sensor with only its analogue filter and delay, which act before sampling."""
     no_samples = {"offset": np.zeros(()), "noise": None, "range": None, "resolution": None}
     no_filter = {"filter": None} if sensor.has_digital_filter else {}
     return dataclasses.replace(sensor, sampling_period=None, **no_samples, **no_filter)

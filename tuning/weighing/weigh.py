@@ -19,10 +19,10 @@ from tuning.logs.log import Log
 from tuning.weighing.matching_pursuit import MatchingPursuit
 
 _LOAD_PARAMETERS = ("mass", "speed", "entry_time")
-# The first fit has so many loads that each reduced the static residual to this share or less.
+# Loads are added before the first fit as long as each reduces the residual to this ratio or less.
 _MAX_MISFIT_RATIO = 0.7
-# Residual over readings (RMS) beyond which not even one load is found.
-_MAX_RESIDUAL_SHARE = 0.65
+# Residual over readings (RMS) above which no load is found.
+_MAX_RELATIVE_RESIDUAL = 0.65
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def weigh(
     case = dataclasses.replace(case, vehicle_sensors=())
     pursuit = MatchingPursuit(case, log, (low, high), both_ways)
     first = pursuit.find(1)
-    if first.residual_rms > _MAX_RESIDUAL_SHARE:
+    if first.residual_rms > _MAX_RELATIVE_RESIDUAL:
         raise ValueError(f"{log.source}: no load is found in it at these speeds")
     found = first
     while len(found.loads) < max_count and (
