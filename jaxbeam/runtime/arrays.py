@@ -329,6 +329,47 @@ def not_differentiated(value: Any, reason: str) -> Any:
     return itself(value + 0)
 
 
+@functools.cache
+def _refused_change():
+    """Primitive for the change of what has no derivative: NaN, and ValueError in reverse."""
+    from jax.interpreters import ad, batching, mlir  # late: not part of JAX in a browser
+
+    def _refuse(cotangent, *_, reason):
+        raise ValueError(reason)
+
+    def unknown(change, reason):
+        return change * jnp.nan
+
+    primitive = jax.extend.core.Primitive("refused_change")
+    primitive.def_impl(unknown)
+    primitive.def_abstract_eval(lambda change, reason: change)
+    mlir.register_lowering(primitive, mlir.lower_fun(unknown, multiple_results=False))
+    ad.deflinear2(primitive, _refuse)
+    batching.defvectorized(primitive)
+    return primitive
+
+
+def without_derivative(value: Any, numbers: Any, reason: str) -> Any:
+    """A value that depends on a tree of numbers in steps or at random, so that none is its slope.
+
+    Its derivatives by them are NaN in forward mode, where it may stand beside others that have one;
+    in reverse they raise ValueError, with a reason.
+    """
+    numbers = [leaf for leaf in jax.tree.leaves(numbers) if isinstance(leaf, jax.core.Tracer)]
+
+    @jax.custom_jvp
+    def itself(value, numbers):
+        return value
+
+    @itself.defjvp
+    def _(primals, tangents):
+        parts = [jnp.sum(part) for part in tangents[1] if part.dtype != jax.dtypes.float0]
+        change = _refused_change().bind(sum(parts, jnp.zeros(())), reason=reason)
+        return primals[0], jnp.broadcast_to(change, primals[0].shape)
+
+    return itself(jnp.asarray(value), numbers) if numbers else value
+
+
 def fori_loop(start: int, end: int, step: Callable, carry) -> Any:
     """`jax.lax.fori_loop`; concrete numbers are looped over in Python."""
     return scan(lambda carry, i: (step(i, carry), None), carry, np.arange(start, end))[0]

@@ -65,10 +65,11 @@ class Record(RecordViews):
     solution of its optimisation. If the closed loop diverges, which its growth shows (see
     `jaxbeam.integrator.growth`), the samples are NaN from then on, and so are the peaks.
     `error_estimate`, of steps and peaks, is relative to the largest deflection, `step_errors` to
-    the largest value of what each sensor measures. `controller_readings` are the
-    readings that a sampled controller has received, None without one; `acting_command` are the
-    commands behind hysteresis and creep of the actuators, None if no actuator has any. `result` is
-    zero, or the sum of what is wrong with the run (see `Result`).
+    the largest value of what each sensor measures; both have no derivatives, which `grad` refuses
+    and `jvp` gives as NaN. `controller_readings` are the readings that a sampled controller has
+    received, None without one; `acting_command` are the commands behind hysteresis and creep of the
+    actuators, None if no actuator has any. `result` is zero, or the sum of what is wrong with the
+    run (see `Result`).
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

@@ -36,7 +36,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     vehicle_readings,
 )
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, any_jax, put, xp
+from jaxbeam.runtime.arrays import Array, any_jax, put, without_derivative, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import (
     closed_loop,
@@ -69,6 +69,10 @@ from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 
 MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough
 LARGEST_SHORTENING = 4.0  # largest factor of one of them
+NO_DERIVATIVE = (
+    "{} of a record has no derivative, as it tells errors of steps that jump with the numbers of a"
+    " case: leave it out of what is differentiated, or compare several values"
+)
 
 
 class ContactLossWarning(UserWarning):
@@ -188,8 +192,15 @@ def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float,
     `inside` says whether the numbers of the case are within the ranges of the plan.
     """
     # Default times by their number: a compiled run computes them from two numbers of the case.
+    numbers = case, times
     times = sample_count(case) if times is None else xp.asarray(times, float)
-    return _with_warning(_run(case, plan, times, tolerance, inside))
+    record = _run(case, plan, times, tolerance, inside)
+    estimates = ("error_estimate", "step_errors")
+    refused = {
+        name: without_derivative(getattr(record, name), numbers, NO_DERIVATIVE.format(name))
+        for name in estimates
+    }
+    return _with_warning(dataclasses.replace(record, **refused))
 
 
 def plan_of_peaks(case: Case, times, tolerance: float) -> IntegrationPlan:

@@ -1,5 +1,7 @@
 """Derivatives of peaks and readings by every number of a case, against differences."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -102,3 +104,45 @@ def test_a_sensor_moves_under_steps_of_several_lengths():
 
     slope = jax.jvp(peak, (0.2,), (1.0,))[1]
     assert_allclose(slope, (peak(0.2 + 1e-5) - peak(0.2 - 1e-5)) / 2e-5, rtol=1e-5)
+
+
+OUTPUTS = (
+    *("reactions", "sensor_values", "deflection", "measured", "truncation_errors"),
+    *("peak_command", "effort", "stroke", "absorber_force", "absorber_energy"),
+)
+WITHOUT_DERIVATIVE = "error_estimate", "step_errors"
+
+
+def test_all_numbers_of_a_record_have_their_derivative_or_refuse_it():
+    case = jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=3),
+        sensors=[jb.Sensor(0.25), jb.Sensor(0.2, "moment"), jb.Sensor(0.4, "acceleration")],
+        actuators=[jb.PointForce(0.45)],
+        controller=jb.Feedback([300.0], period=0.002),
+        absorbers=[jb.Absorber(0.3, mass=0.05, stiffness=100.0, damping=0.2)],
+        loads=[jb.MovingMass(mass=0.8, speed=6.0)],  # loses contact
+        run=jb.Run(0.2, 200.0),
+    )
+
+    def outputs(mass):
+        record = jb.simulate(jb.replace(case, {"loads.0.mass": mass}))
+        envelope = record.envelope("moment", np.array([0.2, 0.3]))
+        names = [*(field.name for field in dataclasses.fields(record)), *OUTPUTS]
+        found = {name: getattr(record, name) for name in names}
+        found |= {f"envelope.{name}": getattr(envelope, name) for name in ("smallest", "largest")}
+        floats = (k for k, v in found.items() if getattr(v, "size", 0) and v.dtype.kind == "f")
+        return {k: found[k] for k in floats}
+
+    _, tangents = jax.jvp(outputs, (0.8,), (1.0,))
+    above, below = outputs(0.8 + 1e-4), outputs(0.8 - 1e-4)
+    assert len(tangents) > 30
+    for name, tangent in tangents.items():
+        if name in WITHOUT_DERIVATIVE:
+            assert np.all(np.isnan(tangent))
+            with pytest.raises(ValueError, match=f"{name} of a record has no derivative"):
+                jax.grad(lambda mass, name=name: xp.sum(outputs(mass)[name]))(0.8)
+        else:
+            slopes = (np.asarray(above[name]) - np.asarray(below[name])) / 2e-4
+            scale = np.nanmax(np.abs(slopes), initial=0.0)
+            tangent = np.where(np.isnan(slopes), np.nan, tangent)
+            assert_allclose(tangent, slopes, rtol=0, atol=1e-5 * scale, err_msg=name)
