@@ -106,6 +106,7 @@ FUNCTIONS = {
         lambda a: arrays.checkpoint(xp.sin, jax.checkpoint_policies.everything_saveable)(a),
         VECTOR,
     ),
+    "without_derivative": (lambda a: arrays.without_derivative(a, a, "it jumps"), VECTOR),
 }
 
 
