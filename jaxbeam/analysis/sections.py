@@ -51,6 +51,8 @@ __all__ = [
     "shear_force",
 ]
 
+BLOCK_ENTRIES = 2**22  # of the largest array for the points of an envelope that are taken at once,
+LEAST_BLOCK = 8  # which are so many at least
 AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
 
 
@@ -126,8 +128,12 @@ def envelope(
 
     def at(x):
         points = sections(case, x, quantity)
-        sensors = tuple(Sensor(point, quantity, **parameters) for point in points.points)
-        lowest, highest = calculate(case, plan, sample_times(case), sensors)
+        found = []
+        for own in _blocks(case, points.points, quantity):
+            sensors = tuple(Sensor(point, quantity, **parameters) for point in own)
+            found.append(calculate(case, plan, sample_times(case), sensors))
+        count = points.points.shape[0]
+        lowest, highest = (xp.concatenate(parts)[:count] for parts in zip(*found, strict=True))
         return Envelope(points.smallest(lowest), points.largest(highest), x, quantity)
 
     def curves(found):
@@ -148,6 +154,23 @@ def envelope(
     x = xp.asarray(x, float)
     check_on_beam("x", x, case.beam.length)
     return at(x)
+
+
+def _blocks(case: Case, points: Float[Array, " point"], quantity: str) -> list:
+    """The points in equal blocks, of which the last is filled up with its last point.
+
+    Steps end where a wheel passes a point of what bends. Each step has a row for each point, so
+    that the entries of all of these are as the square of the points that are computed at once.
+    """
+    count = points.shape[0]
+    if not QUANTITIES[quantity].bends:
+        return [points]
+    of_two = 192 * case.beam.modes * max(1, load_set(case).inertia.shape[0])
+    most = max(LEAST_BLOCK, int((BLOCK_ENTRIES / of_two) ** 0.5))
+    blocks = -(-count // most)
+    size = -(-count // max(1, blocks))
+    index = np.minimum(np.arange(blocks * size), count - 1)
+    return [points[own] for own in index.reshape(blocks, size)]
 
 
 def _envelope(case, plan, times, sensors):

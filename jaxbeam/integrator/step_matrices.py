@@ -141,7 +141,10 @@ def chunk_length(
     batch = loads.inertia.shape[1]
     shared = not loads.wheels.vehicles and share_matrices(loads.inertia)
     of_matrices = (1 if shared else batch) * max(compliance, rows * states, transition)
-    entries = max(of_matrices, batch * (rows + states))
+    monitored = 0
+    if discrete.load_influence is not None:  # of the loads on the outputs, of each step its own
+        monitored = discrete.monitored_transition.shape[1] * (states + rows)
+    entries = max(of_matrices, batch * (rows + states), monitored)
     if prepared:
         return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
     if any_jax(loads):
