@@ -188,9 +188,8 @@ def test_commands_that_are_logged_once_a_period_are_seen_by_delays():
     np.testing.assert_allclose(fit.values[3:], 0.5e-3, rtol=0.02)
 
 
-def test_readings_between_the_samples_of_a_loop():
-    """A force on a beam under feedback held for 4 ms, logged every ms; steps are exact."""
-    gain, period, step, speed, weight = 400.0, 4, 1e-3, 1.0, 3.0
+def loop_readings(gain, period, step, speed, weight):
+    """Times, deflection and held commands of a force on a beam under feedback; steps are exact."""
     frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
     zero, n = np.zeros((MODES, MODES)), MODES
     # The force is a sine of each mode: oscillators of their own, cut off as it leaves.
@@ -209,15 +208,20 @@ def test_readings_between_the_samples_of_a_loop():
     A, B = scipy.signal.cont2discrete((A, B, A[:1], [[0.0]]), step, "zoh")[:2]
     count = round(LENGTH / speed / step) + 1
     state = np.concatenate([np.zeros(3 * n), np.ones(n)])
-    reading, readings, held = np.append(shapes(0.3), np.zeros(3 * n)), [], 0.0
+    reading, readings, commands = np.append(shapes(0.3), np.zeros(3 * n)), [], []
     for i in range(count):
         readings.append(reading @ state)
-        held = -gain * readings[-1] if i % period == 0 else held
-        state = A @ state + B[:, 0] * held
-    readings = np.array(readings)[:, None]
+        commands.append(-gain * readings[-1] if i % period == 0 else commands[-1])
+        state = A @ state + B[:, 0] * commands[-1]
+    return step * np.arange(count), -np.array(readings)[:, None], -np.array(commands)[:, None]
+
+
+def test_readings_between_the_samples_of_a_loop():
+    """A force on a beam under feedback held for 4 ms, logged every ms."""
+    gain, period, step, speed, weight = 400.0, 4, 1e-3, 1.0, 3.0
+    times, readings, _ = loop_readings(gain, period, step, speed, weight)
     noise = 2e-7 * np.random.default_rng(5).normal(size=readings.shape)
-    times = step * np.arange(count)
-    log = Log(times, noise - readings, ("w",), ("deflection",), ("m",), sensors=(0,))
+    log = Log(times, readings + noise, ("w",), ("deflection",), ("m",), sensors=(0,))
     loop = jb.Case(
         jb.Beam(LENGTH, RIGIDITY, DENSITY, damping_ratio=DAMPING, modes=MODES),
         actuators=[jb.PointForce(0.5)],
@@ -234,6 +238,27 @@ def test_readings_between_the_samples_of_a_loop():
     assert np.all(np.abs(fit.values - [RIGIDITY, gain]) < 4 * fit.errors)
     assert fit.verdict.startswith("the model explains the logs")
     assert "sampling_period" not in str(fit)
+
+
+def test_a_feedback_that_is_logged_as_the_command_is_told():
+    """The signal before it is sampled and held is no command; with what is held fits are right."""
+    gain, period, speed, weight = 400.0, 10, 1.0, 3.0
+    times, readings, commands = loop_readings(gain, period, 1e-3, speed, weight)
+    readings = readings + 2e-7 * np.random.default_rng(5).normal(size=readings.shape)
+    beam = jb.Beam(LENGTH, 0.95 * RIGIDITY, DENSITY, damping_ratio=DAMPING, modes=MODES)
+    loads = [jb.MovingForce(force=weight, speed=speed)]
+    start = jb.Case(beam, actuators=[jb.PointForce(0.5)], sensors=[jb.Sensor(0.3)], loads=loads)
+    kinds = ("w", "u"), ("deflection", "force"), ("m", "N")
+
+    def fit_of(channel):
+        values = np.concatenate([readings, channel], axis=1)
+        log = Log(times, values, *kinds, sensors=(0, None), actuators=(None, 0))
+        return identify(start, [log], ["beam.flexural_rigidity"])
+
+    right, wrong = fit_of(commands), fit_of(-gain * readings)
+    assert abs(right.values[0] - RIGIDITY) < 4 * right.errors[0] < 1e-4 * RIGIDITY
+    assert right.verdict.startswith("the model explains the logs")
+    assert wrong.verdict.startswith("the model misses something")
 
 
 def test_faulty_commands_are_refused():
