@@ -740,6 +740,14 @@ def test_beams_that_are_not_held_and_cases_without_loads():
     assert found.warnings == ()
 
 
+def test_a_filter_of_a_beam_that_no_load_leaves_looks_right():
+    """Its cutoff is judged by the crossings of loads, of which there are none."""
+    sensors = [jb.Sensor(position=12.5, filter=jb.Filter(20.0))]
+    load = jb.VaryingForce(force=3e5, frequencies=[2.0], amplitudes=[1e4], position=12.5)
+    case = dataclasses.replace(bridge(sensors=sensors), loads=(load,))
+    assert jb.check(case).warnings == ()
+
+
 def test_a_run_without_a_load_on_the_beam_is_not_praised():
     record = jb.simulate(bridge(load={"entry_time": 10.0}, run={"duration": 4.0}))
     assert record.verdict.startswith("no load is on the beam during the run")
