@@ -191,8 +191,8 @@ def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float,
 
     `inside` says whether the numbers of the case are within the ranges of the plan.
     """
-    # Default times by their number: a compiled run computes them from two numbers of the case.
     numbers = case, times
+    # Default times by their number: a compiled run computes them from two numbers of the case.
     times = sample_count(case) if times is None else xp.asarray(times, float)
     record = _run(case, plan, times, tolerance, inside)
     estimates = ("error_estimate", "step_errors")
