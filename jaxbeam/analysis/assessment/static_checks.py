@@ -63,7 +63,7 @@ def largest_moments(case: Case) -> list[CheckedSection]:
         x, found = refined(case, at, curves, np.linspace(a, b, SPAN_POSITIONS))
         best = int(np.argmax(found))
         if found[best] > (1 + SETTLED) * found[np.argmin(np.abs(x - (a + b) / 2))]:
-            name = f"largest moment in span {i}, at {x[best]:.4g} m"
+            name = f"moment at {x[best]:.4g} m, where LM71 has its largest in span {i}"
             sections.append(CheckedSection(name, "moment", float(x[best])))
     return sections
 
