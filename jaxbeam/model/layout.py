@@ -1,6 +1,7 @@
 """Layout of a beam: order of nodes at supports, patch edges, hinges and edges of segments."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -45,6 +46,16 @@ class Layout:
     degrees: tuple[int, ...]
     segments: tuple[int, ...] = ()
     parts: tuple[int, ...] = ()
+
+
+def largest_layout(layouts: Sequence[Layout]) -> Layout | None:
+    """Layout with the largest degrees and parts of several; None if they differ in others."""
+    largest = {
+        name: tuple(map(max, zip(*(getattr(one, name) for one in layouts), strict=False)))
+        for name in ("degrees", "parts")
+    }
+    common = [dataclasses.replace(one, **largest) for one in layouts]
+    return common[0] if all(one == common[0] for one in common) else None
 
 
 def is_uniform(case: Case) -> bool:

@@ -42,6 +42,7 @@ from jaxbeam.integrator.step_size import (
     steps_per_interval,
 )
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule
+from jaxbeam.model.layout import largest_layout
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, any_jax, xp
@@ -133,7 +134,7 @@ def check_origin(
     ):
         return True
     own = static_shapes(case)
-    if own.layout != shapes.layout or own.coupled > shapes.coupled:
+    if largest_layout((own.layout, shapes.layout)) != shapes.layout or own.coupled > shapes.coupled:
         raise ValueError(
             "the plan was made for a case with supports, actuators or sections in another order"
             f" along the beam, or without dampers between modes: {INSTEAD}"
@@ -389,12 +390,14 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
     the cases by `what`, if they differ in the order of positions along the beam.
     """
     first = plans[0]
-    if any(plan.shapes.layout != first.shapes.layout for plan in plans):
+    layout = largest_layout([plan.shapes.layout for plan in plans])
+    if layout is None:
         raise ValueError(
             f"the {what} differ in the order of positions along the beam; treat them separately"
         )
     shapes = dataclasses.replace(
         first.shapes,
+        layout=layout,
         coupled=any(plan.shapes.coupled for plan in plans),
         max_loads=max(plan.shapes.max_loads for plan in plans),
     )

@@ -19,6 +19,7 @@ from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
+from jaxbeam.model.layout import largest_layout
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.model.modes import Layout, mesh_layout
@@ -146,22 +147,13 @@ def common_layout(case: Case, batches: Batches) -> Layout:
     values = np.unique(batches.shared_values[:, varying], axis=0)
     names = [batches.shared_addresses[i] for i in varying]
     layouts = [mesh_layout(replace(case, dict(zip(names, row, strict=True)))) for row in values]
-    largest = {name: _largest(layouts, name) for name in ("degrees", "parts")}
-    common = {dataclasses.replace(layout, **largest) for layout in layouts}
-    if len(common) > 1:
+    largest = largest_layout(layouts)
+    if largest is None:
         raise ValueError(
             f"positions along the beam change their order over {', '.join(names)}: split the sweep "
             "where supports or patch ends meet"
         )
-    return common.pop()
-
-
-def _largest(layouts: list[Layout], name: str) -> tuple[int, ...]:
-    """Largest degrees or parts of each element in any layout, where all have as many elements."""
-    numbers = [getattr(layout, name) for layout in layouts]
-    if len({len(of_layout) for of_layout in numbers}) > 1:
-        return numbers[0]
-    return tuple(map(int, np.max(numbers, axis=0)))
+    return largest
 
 
 class RunSizes(NamedTuple):

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.time_grid import EventSchedule, stack_schedules
+from jaxbeam.model.layout import largest_layout
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 from tuning.fit.uncertainty.covariance import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log
@@ -57,8 +58,9 @@ class Dataset:
                 )
             except (ValueError, RuntimeError) as error:
                 return f", to a case that cannot be simulated: {error}"
+            layouts = plan.shapes.layout, self.plan.shapes.layout
             changed = (
-                plan.shapes.layout != self.plan.shapes.layout
+                largest_layout(layouts) != self.plan.shapes.layout
                 or plan.shapes.max_loads > self.plan.shapes.max_loads
             )
             if changed or plan.substeps > 2 * self.plan.substeps:
