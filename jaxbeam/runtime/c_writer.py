@@ -124,9 +124,15 @@ class Writer:
         return found
 
     def run(self, closed, inputs: Sequence[CArray]) -> list[CArray]:
-        """Write the equations of a jaxpr; its outputs. An open one takes its constants first."""
-        jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
-        given = [*(self.constant(np.asarray(constant)) for constant in constants), *inputs]
+        """Write the equations of a jaxpr; its outputs."""
+        constants = map(self.constant, map(np.asarray, getattr(closed, "consts", ())))
+        return self.run_open(getattr(closed, "jaxpr", closed), list(constants), inputs)
+
+    def run_open(
+        self, jaxpr, constants: Sequence[CArray], inputs: Sequence[CArray]
+    ) -> list[CArray]:
+        """Write the equations of a jaxpr with arrays of C for its constants; its outputs."""
+        given = [*constants, *inputs]
         variables = [*jaxpr.constvars, *jaxpr.invars]
         values: dict[Any, CArray] = dict(zip(variables, given, strict=True))
 

@@ -173,7 +173,8 @@ def _text(jaxpr, arrays, leaves, state) -> str:
         given.append(_loaded(writer, stored, kind_of(leaf)))
         place += leaf.size
     given.append(CArray("d", state.shape, "state", True))
-    commands, *after = writer.run(jaxpr, given)
+    constants = len(jaxpr.constvars)
+    commands, *after = writer.run_open(jaxpr, given[:constants], given[constants:])
     writer.copy(CArray("d", commands.shape, "commands", True), commands)
     for stored, value in zip(kept, after, strict=True):
         writer.copy(stored, writer.converted(value, "d"))
