@@ -472,8 +472,8 @@ class _Store(NamedTuple):
         """
         store = cls(path, {}, {})
         if not path.exists():
-            with whole_file(path) as beside:
-                beside.write_text(json.dumps({"format": FORMAT, "mark": mark}) + "\n")
+            with whole_file(path) as partial:
+                partial.write_text(json.dumps({"format": FORMAT, "mark": mark}) + "\n")
             return store
         head, *entries = read_text_input(path, "store of vehicles").split("\n")
         content = _entry(head)
