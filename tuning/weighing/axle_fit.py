@@ -1,18 +1,18 @@
 """Axle forces, distances and speed by generalised least squares.
 
-With the readings u_s (`InfluenceLines.crossing`) of a force of one newton on axle a, those of a
-crossing are
+With the readings u_s (`InfluenceLines.crossing`) of a force of one newton on axle a, the readings
+of a crossing are
 
     y_s(t) = sum_a P_a u_s(t; v, t_0, x_a) + c_s + e_s(t),   cov e = S + d^2 B B' + E E'.
 
-S is the white noise of the sensors; the columns of B are readings of dynamic wheel forces
-(see below), d their share of the static ones, and those of E are what the deviations of
-calibrated influence lines make of the axle forces. The share d has the greatest restricted
-likelihood (Patterson and Thompson 1971, DOI 10.1093/biomet/58.3.545). The covariance of all
-parameters is that of the weighted problem, times what the residuals exceed this noise by.
+S is the covariance of the white noise of the sensors; the columns of B are readings of dynamic
+wheel forces (see below), d is their fraction of the static forces, and the columns of E are
+readings of the axle forces on the deviations of calibrated influence lines. The fraction d
+maximises the restricted likelihood (Patterson and Thompson 1971, DOI 10.1093/biomet/58.3.545). The
+covariance of all parameters is that of the weighted problem, times the excess of the residuals.
 
-What readings tell little of is known before: axles of a group share its load and are about 1.35 m
-apart.
+A prior helps where readings contain little information: axles of a group have similar loads and are
+about 1.35 m apart.
 
 Errors of weighing by the dynamic wheel forces of an unknown road.
 
@@ -25,8 +25,8 @@ fitted by least squares with the Jacobian J have
 
     (J'J)^-1 J' C J (J'J)^-1.
 
-The share d follows from the residuals r = (1 - H) e, H = J (J'J)^-1 J': their power is that of the
-noise, and d^2 |(1 - H) B|^2.
+The fraction d follows from the residuals r = (1 - H) e, H = J (J'J)^-1 J': their power is that of
+the noise, and d^2 |(1 - H) B|^2.
 """
 
 import copy
@@ -48,7 +48,7 @@ BODIES, HOPS = (1.3, 1.6, 2.0, 2.5, 3.0), (9.0, 11.0, 13.5)
 # Mass of the axle over that of the body on it; damping ratio of the body, loss factor of tyres.
 UNSPRUNG, DAMPING, LOSS = 0.12, 0.16, 0.1
 LOWEST, HIGHEST, SPACING = 0.6, 20.1, 0.3  # Hz, of the waves
-SHARES = 1e-4, 0.5  # of dynamic wheel forces in the static ones; worst roads have 0.3
+DYNAMIC_LIMITS = 1e-4, 0.5  # of d, dynamic over static wheel forces; worst roads have 0.3
 
 
 @functools.cache
@@ -57,7 +57,7 @@ def _total_power() -> float:
 
 
 def _power(f: Float[np.ndarray, " wave"]) -> Float[np.ndarray, " wave"]:
-    """Spectrum of wheel forces at frequencies (Hz), but for a factor.
+    """Spectrum of dynamic wheel forces at frequencies (Hz), up to a factor.
 
     It is that of quarter cars on a road of heights ~ 1 / frequency (ISO 8608), in the mean of usual
     bodies and axles, each with forces of one variance.
@@ -74,7 +74,7 @@ def _power(f: Float[np.ndarray, " wave"]) -> Float[np.ndarray, " wave"]:
 
 
 class DynamicErrors(NamedTuple):
-    """Covariance of fitted parameters, the share d of the dynamic wheel forces, and its freedom."""
+    """Covariance of fitted parameters, and d, the ratio of dynamic to static wheel forces."""
 
     covariance: Float[np.ndarray, "parameter parameter"]
     share: float
@@ -97,9 +97,9 @@ def dynamic_waves(
     forces: Float[np.ndarray, " axle"],
     times: Float[np.ndarray, " time"],
 ) -> Float[np.ndarray, "time wave sensor"]:
-    """Readings B of the waves of dynamic axle forces, and of the vibration that they excite.
+    """Readings B of dynamic axle forces as waves in time, with the vibration that they excite.
 
-    Waves are counted from the entry of the first axle.
+    The phase of a wave is zero at the entry of the first axle.
     """
     rate = (times.size - 1) / (times[-1] - times[0])
     frequencies = np.arange(LOWEST, min(HIGHEST, max(0.4 * rate, 2 * LOWEST)), SPACING)
@@ -161,24 +161,25 @@ def white_noise(
     return np.maximum(1.4826 * np.array(levels) / np.sqrt(6), 1e-9 * readings.std(axis=0))
 
 
-STEPS = 1e-4  # of lengths and times in differences, of the bridge and its crossing
+STEPS = 1e-4  # of finite differences, relative to length and duration of the crossing
 ITERATIONS = 12  # of Gauss and Newton
 MAX_ROWS, RATE = 900, 100.0  # samples of all sensors, and in a second; of more, means are taken
-LOADED = 0.12  # share of the largest reading, above which there is something on the bridge
-MARGIN = 5.0  # m, by which axles may enter earlier, or leave later, than readings tell so
-MARGIN_SHARE, MARGIN_TIME = 0.15, 0.25  # of the loaded time, and s, that are used before and after
-CORRELATION = 0.05  # s, of dynamic wheel forces: their share follows from so many of these times
-SHARE_SPREAD = 0.3  # of the logarithm of the share of dynamic wheel forces
-SPEED_SPREAD = 0.03  # of the speed of the start, relative
+LOADED = 0.12  # fraction of the largest reading, above which there is something on the bridge
+MARGIN = 5.0  # m, by which axles may enter earlier, or leave later, than readings show
+# Fraction of the loaded time, and s, of readings used before and after the loaded time.
+MARGIN_FRACTION, MARGIN_TIME = 0.15, 0.25
+CORRELATION = 0.05  # s, correlation time of dynamic wheel forces
+RATIO_SPREAD = 0.3  # standard deviation of the logarithm of d
+SPEED_SPREAD = 0.03  # standard deviation of the initial speed, relative
 FREQUENCY_SPREADS = 0.01, 0.03  # of the first mode of the bridge, and of others, relative
 MOST_CHANGE = 0.1  # of logarithms of these
 MIN_GAP = 0.6  # m, between axles: less than any tandem's
-MIN_AXLE_SHARE = 0.04  # of the gross weight, in an axle: less stands for something else
+MIN_AXLE_FRACTION = 0.04  # of the gross weight, of a real axle
 GROUP_GAP = 2.2  # m, of axles of one group (COST 323)
-# Standard deviations of what is known before: differences of loads of neighbours in a group, in
-# their mean; gaps (m) in a group about their mean.
+# Prior: standard deviation of the load difference of neighbours in a group, over their mean; mean
+# and standard deviation of gaps (m) in a group.
 EQUAL, GROUP_MEAN, GROUP_SPREAD = 0.12, 1.35, 0.1
-LOAD_SPREAD = 0.35  # of logarithms of the loads of a vehicle
+LOAD_SPREAD = 0.35  # standard deviation of the logarithms of the axle loads of a vehicle
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -186,9 +187,9 @@ class AxleFit:
     """Axles on a bridge with the covariance of their forces (N), speed, entry time and offsets.
 
     `covariance` is that of forces, speed (m/s), entry time (s) and offsets (m) behind the first
-    axle, in this order; `dynamic_share` is d. Residuals have `excess` times the variance that noise
-    and usual dynamic wheel forces give them. `deviance` is minus twice the log-likelihood but for
-    a constant of the readings, at the best parameters.
+    axle, in this order; `dynamic_share` is d. Residuals have `excess` times the variance of noise
+    and usual dynamic wheel forces. `deviance` is minus twice the log-likelihood at the best
+    parameters, up to a constant of the readings.
     """
 
     geometry: AxleGeometry
@@ -204,8 +205,8 @@ class AxleFit:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether no axle is so light that it stands for something else."""
-        return bool(self.forces.min() > MIN_AXLE_SHARE * self.forces.sum())
+        """Whether every axle is heavy enough to be a real one."""
+        return bool(self.forces.min() > MIN_AXLE_FRACTION * self.forces.sum())
 
     @property
     def errors(self) -> Float[np.ndarray, " parameter"]:
@@ -230,10 +231,10 @@ class AxleFit:
 
     @property
     def criterion(self) -> float:
-        """The lower, the more likely the number of axles (Schwarz 1978), in units of the deviance.
+        """Criterion of the number of axles (Schwarz 1978): deviance plus penalty; lower is better.
 
         An axle adds a load and a place, of which little is new in a group. Axles of one vehicle
-        have loads within a factor of two or so: more stands for several.
+        have loads within a factor of two or so: a wider range suggests several vehicles.
         """
         return self.deviance + unlikeliness(self.rows, self.geometry.offsets, self.forces)
 
@@ -256,9 +257,9 @@ def axle_groups(offsets: Float[np.ndarray, " axle"]) -> list[list[int]]:
 
 
 def unlikeliness(rows: int, offsets, forces) -> float:
-    """What a number of axles adds to the deviance of so many rows in `AxleFit.criterion`.
+    """Penalty of the axles on the deviance in `AxleFit.criterion`, for a number of rows.
 
-    Infinity for axles without force.
+    Infinite for axles without force.
     """
     axles, groups = forces.size, len(axle_groups(offsets))
     if not np.any(forces > 0):
@@ -269,13 +270,13 @@ def unlikeliness(rows: int, offsets, forces) -> float:
 
 
 class Weights(NamedTuple):
-    """Inverse of the lower factor of a covariance of rows in units of the noise."""
+    """Whitening of rows (in units of the noise) by the Cholesky factor of their covariance."""
 
     factor: Float[np.ndarray, "row row"]
-    unlikely: float = 0.0  # deviance of the share of dynamic wheel forces
+    unlikely: float = 0.0  # deviance of d in its prior
 
     def __call__(self, rows):
-        """Rows in units of the noise, weighted."""
+        """Whitened rows."""
         return scipy.linalg.solve_triangular(self.factor, rows, lower=True, check_finite=False)
 
     @property
@@ -285,7 +286,7 @@ class Weights(NamedTuple):
 
 
 class AxleTrain(NamedTuple):
-    """Axles of one speed and their forces (N), by lines, with dynamic wheel forces of a share."""
+    """Axles of one speed, their forces (N), influence lines, and d of the dynamic forces."""
 
     lines: InfluenceLines
     geometry: AxleGeometry
@@ -296,9 +297,9 @@ class AxleTrain(NamedTuple):
 class CrossingLog:
     """Readings (SI units) of a crossing, in units of the white noise of each sensor.
 
-    `speed` (m/s) is what is known of it before the fit, within some per cent; `seen` the geometry
-    that detectors of axles tell, with standard deviations of speed (m/s), entry time (s) and
-    offsets (m). `fixed` is the covariance of what is not modelled.
+    `speed` (m/s) is the speed before the fit, within some per cent; `seen` the geometry measured by
+    axle detectors, with standard deviations of speed (m/s), entry time (s) and offsets (m). `fixed`
+    is the covariance of other axles on the bridge and of noise.
     """
 
     speed: float | None = None
@@ -311,7 +312,7 @@ class CrossingLog:
         valid: np.ndarray,
     ):
         first, last = loaded_times(times, readings)
-        margin = MARGIN_SHARE * (last - first) + MARGIN_TIME
+        margin = MARGIN_FRACTION * (last - first) + MARGIN_TIME
         near = (times > first - margin) & (times < last + margin)
         times, readings, valid = times[near], readings[near], valid[near]
         rate = (times.size - 1) / (times[-1] - times[0])
@@ -334,7 +335,7 @@ class CrossingLog:
         self.fixed = np.eye(self.target.size)
 
     def without(self, train: "AxleTrain") -> "CrossingLog":
-        """The log less other axles on the bridge, of whose numbers hardly anything is known."""
+        """Log without the readings of other axles, whose errors are added to the covariance."""
         lines, geometry, forces, share = train
         model, explained = _Model(lines, self, geometry), lines.crossing(geometry, self.times)
         columns, x = self.rows(explained), model.first(forces)
@@ -353,19 +354,19 @@ class CrossingLog:
         return found
 
     def places(self, speed: float, length: float) -> tuple[float, float]:
-        """How far axles may have come (m) at time 0, less the speed times it, least and most."""
+        """Least and largest distance (m) that axles lie behind the entry at time zero."""
         first, last = self.loaded
         return abs(speed) * first - MARGIN, max(
             abs(speed) * last - length, abs(speed) * first
         ) + MARGIN
 
     def rows(self, table: Float[np.ndarray, "time number sensor"]):
-        """Rows (sensor by sensor) of the samples that count, in units of the noise."""
+        """Rows (sensor by sensor) of the valid samples, in units of the noise."""
         flat = table.transpose(2, 0, 1).reshape(self.scale.size, -1)
         return (flat * self.scale[:, None])[self.used]
 
     def linear(self, lines: InfluenceLines, geometry: AxleGeometry, weights: Weights):
-        """Weighted sum of squares of the best forces at a geometry, and these forces (N)."""
+        """Weighted sum of squares with the best forces at a geometry, and these forces (N)."""
         columns = np.hstack([self.rows(lines.crossing(geometry, self.times)), self.shifts])
         columns, target = weights(columns), weights(self.target)
         sizes = _sizes(columns, geometry.offsets.size)
@@ -387,10 +388,10 @@ def loaded_times(times, readings) -> tuple[float, float]:
 
 
 class _Model:
-    """Readings and slopes at numbers.
+    """Residuals and Jacobian of the readings of a crossing at parameters x.
 
-    These are forces, speed, entry time, offsets, shifts, and changes of the logarithms of the
-    frequencies in which the bridge vibrates.
+    Parameters are forces, speed, entry time, offsets, shifts of the sensors, and changes of the
+    logarithms of the frequencies of the bridge.
     """
 
     def __init__(self, lines: InfluenceLines, log: CrossingLog, start: AxleGeometry):
@@ -398,14 +399,14 @@ class _Model:
         self.count, self.modes = start.offsets.size, len(lines.modes)
 
     def first(self, forces):
-        """Numbers of the start."""
+        """Initial parameters from forces (N) and the geometry of the start."""
         self.least = 0.01 * max(float(forces.sum()), 1e-12)
         at = self.start
         entry = [at.speed, at.entry_time, *at.offsets[1:]]
         return np.concatenate([forces, entry, np.zeros(self.log.shifts.shape[1] + self.modes)])
 
     def parts(self, x):
-        """Geometry, forces, shifts, lines."""
+        """Geometry, forces (N), shifts and influence lines at parameters."""
         n = self.count
         geometry = AxleGeometry(
             x[n], x[n + 1], np.append(0.0, x[n + 2 : 2 * n + 1]), self.start.length
@@ -414,13 +415,13 @@ class _Model:
         return geometry, x[:n], x[2 * n + 1 : x.size - self.modes], self.lines.tuned(changes)
 
     def residual(self, x):
-        """What a model of numbers leaves of the readings, and its columns by forces."""
+        """Residuals of the readings at parameters, and readings per unit axle force."""
         geometry, forces, shifts, lines = self.parts(x)
         columns = self.log.rows(lines.crossing(geometry, self.log.times))
         return self.log.target - columns @ forces - self.log.shifts @ shifts, columns
 
     def jacobian(self, x, columns):
-        """Slopes of the readings by all numbers."""
+        """Derivatives of the readings with respect to all parameters."""
         geometry, forces, _, lines = self.parts(x)
         times = self.log.times
         step = STEPS * geometry.length / abs(geometry.speed)  # in time
@@ -439,8 +440,8 @@ class _Model:
         tuned = [slopes(geometry, STEPS, one).sum(axis=1, keepdims=True) for one in others]
         return np.hstack([*parts, self.log.shifts, *tuned])
 
-    def known(self, x):
-        """Residuals of what is known before, in standard deviations, and their slopes."""
+    def prior_residuals(self, x):
+        """Residuals of the prior, in standard deviations, and their Jacobian."""
         n = self.count
         forces, offsets = x[:n], np.append(0.0, x[n + 2 : 2 * n + 1])
         close = np.flatnonzero(np.diff(offsets) < GROUP_GAP)
@@ -475,7 +476,7 @@ class _Model:
         return np.array(left), np.array(rows).reshape(-1, x.size)
 
     def allowed(self, x):
-        """Numbers within what is possible: forces that press, axles in order."""
+        """Parameters moved into their bounds: forces that press, axles in order."""
         n, x = self.count, x.copy()
         x[:n] = np.maximum(x[:n], 0.0)
         gaps = np.maximum(np.diff(np.append(0.0, x[n + 2 : 2 * n + 1])), MIN_GAP)
@@ -500,7 +501,7 @@ def fit_axles(
     log: CrossingLog,
     weights: Weights | None = None,
 ) -> AxleFit:
-    """Axles fitted to the readings of a crossing, from a geometry and forces (N)."""
+    """Axles fitted to the readings of a crossing, starting from a geometry and forces (N)."""
     model = _Model(lines, log, start)
     n = model.count
     x = model.first(forces)
@@ -511,14 +512,14 @@ def fit_axles(
         weights, share, excess = _weights(model, x)
     left, columns = model.residual(x)
     jacobian = weights(model.jacobian(x, columns))
-    before, slopes = model.known(x)
+    before, slopes = model.prior_residuals(x)
     jacobian = np.vstack([jacobian, slopes])
     sizes = np.linalg.norm(jacobian, axis=0)
     unseen = sizes < 1e-12 * sizes.max()
     sizes = np.where(unseen, 1.0, sizes)
     inverse = np.linalg.pinv(jacobian / sizes)
     covariance = (inverse @ inverse.T) / np.outer(sizes, sizes)
-    # Readings tell nothing of the place of an axle without a force, nor of one off the bridge.
+    # Readings do not depend on the place of an axle without force, or off the bridge.
     most = np.where(np.arange(sizes.size) < n, max(float(x[:n].sum()), 1e-300), start.length)
     covariance[unseen, unseen] = most[unseen] ** 2
     weighted = weights(left)
@@ -540,18 +541,18 @@ def fit_axles(
 
 
 def refined(fit: AxleFit, start: AxleGeometry, forces, log: CrossingLog):
-    """Deviance, geometry and forces at the weights of a fit, of other axles from a start."""
+    """Deviance, geometry and forces (N) of axles refined from a start, at the weights of a fit."""
     model = _Model(fit.lines, log, start)
     x, squares = _gauss_newton(model, model.first(forces), fit.weights)
     return fit.weights.logarithm + fit.weights.unlikely + squares, *model.parts(x)[:2]
 
 
 def _gauss_newton(model: _Model, x, weights: Weights):
-    """Numbers of least weighted squares, in damped steps, and these squares."""
+    """Parameters of least weighted squares by damped Gauss-Newton steps, and the squares."""
 
     def cost(x):
         left, columns = model.residual(x)
-        before = model.known(x)
+        before = model.prior_residuals(x)
         weighted = weights(left)
         return float(weighted @ weighted + before[0] @ before[0]), weighted, columns, before
 
@@ -579,7 +580,7 @@ def _gauss_newton(model: _Model, x, weights: Weights):
 
 
 def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]:
-    """Weights for dynamic wheel forces at numbers, their share, and the excess of residuals."""
+    """Weights from dynamic wheel forces at parameters, their ratio d, and excess of residuals."""
     log = model.log
     geometry, forces, _, lines = model.parts(x)
     fixed = log.fixed
@@ -599,7 +600,7 @@ def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]
         sizes = np.abs(np.diag(triangle))
         squares, determinant = sizes[-1] ** 2, Weights(factor).logarithm
         level = max(float(squares) / number, 1.0)
-        unlikely = ((log_share + np.log(level) / 2 - usual) / SHARE_SPREAD) ** 2
+        unlikely = ((log_share + np.log(level) / 2 - usual) / RATIO_SPREAD) ** 2
         reduced = 2 * np.sum(np.log(np.maximum(sizes[:-1], 1e-12)))
         deviance = determinant + reduced + number * np.log(level) + squares / level + unlikely
         return deviance, factor, level, unlikely
@@ -607,8 +608,8 @@ def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]
     best = usual
     if not first_time:
         best = scipy.optimize.minimize_scalar(
-            lambda log_share: at(log_share)[0], bounds=tuple(np.log(SHARES)), method="bounded",
-            options={"xatol": 0.1},
+            lambda log_share: at(log_share)[0], bounds=tuple(np.log(DYNAMIC_LIMITS)),
+            method="bounded", options={"xatol": 0.1},
         ).x  # fmt: skip
     _, factor, level, unlikely = at(best)
     share = float(np.exp(best) * np.sqrt(level))
@@ -616,7 +617,7 @@ def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]
 
 
 def _sizes(columns, count):
-    """Norms of columns; those of axles that are hardly on the bridge are not small."""
+    """Norms of columns, with a lower limit for axles that are hardly on the bridge."""
     sizes = np.linalg.norm(columns, axis=0)
     sizes[:count] = np.maximum(sizes[:count], 1e-3 * sizes[:count].max())
     return np.maximum(sizes, 1e-300)
@@ -627,7 +628,7 @@ def _square(table):
 
 
 def _line_errors(lines: InfluenceLines, geometry: AxleGeometry, forces, times):
-    """Readings (time, number, sensor) of the deviations of the lines."""
+    """Readings (time, number, sensor) of the axle forces on the deviations of the lines."""
     assert lines.deviations is not None
     number, points, sensors = lines.deviations.shape
     table = lines.deviations.transpose(1, 0, 2).reshape(points, -1)

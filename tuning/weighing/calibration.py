@@ -6,7 +6,7 @@ fourth differences of g are penalised. Readings of a run r are
 
     y_r = A_r h + c_r + B_r w + e,   w ~ N(0, d^2),   fourth differences of g ~ N(0, 1 / l),
 
-with known axle loads in A_r and waves of dynamic wheel forces in B_r (`dynamic_forces`). These
+with known axle loads in A_r and waves of dynamic wheel forces in B_r (`dynamic_waves`). These
 forces are the same at the same place whenever a vehicle crosses one road at one speed: repeated
 runs of a vehicle at nearly the same speed count as one. Higher modes have the frequency of a clear
 peak of the residuals; all are refined by the likelihood. Shares d, l and the level of e have the
@@ -30,7 +30,7 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.axle_fit import SHARES, CrossingLog, dynamic_waves, white_noise
+from tuning.weighing.axle_fit import DYNAMIC_LIMITS, CrossingLog, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import (
     AxleGeometry,
     InfluenceLines,
@@ -38,14 +38,14 @@ from tuning.weighing.influence_lines import (
 )
 
 KNOTS = 41  # of the smooth part
-FREQUENCY_SHARES = np.geomspace(0.7, 1.8, 40)  # tried, of the model's first frequency
+FREQUENCY_RATIOS = np.geomspace(0.7, 1.8, 40)  # to the model's first frequency, that are tried
 NEAR, STEP = 0.08, 0.02  # of logarithms of the first frequency tried again
 NEAR_PEAK, FINE = 0.03, 0.01  # likewise, of others
 FARTHEST = 0.4  # of logarithms of frequencies, from the first ones
-FAR = np.exp(np.arange(-0.25, 0.2501, 0.005))  # shares of the model's, at which others may peak
+FAR = np.exp(np.arange(-0.25, 0.2501, 0.005))  # ratios to the model's, at which others may peak
 PEAK = 12.0  # times the median, of a clear peak of a periodogram
 SAME_SPEED = 0.1  # relative difference of speeds at which dynamic forces of a vehicle repeat
-KEPT = 1e-8  # share of variance below which a deviation is left out
+KEPT = 1e-8  # fraction of the largest variance below which a deviation is left out
 STIFFNESSES = 1e9, 1e12
 
 
@@ -75,13 +75,13 @@ def calibrate_influence_lines(case: Case, logs: Log | Sequence[Log]) -> Influenc
     model = model_influence_lines(case)
     logs = [logs] if isinstance(logs, Log) else list(logs)
     runs = [_Run(case, log) for log in logs]
-    shares = model.positions / model.length
+    x = model.positions / model.length
+    cubics = np.stack([x * (1 - x), x * (1 - x) * (1 - 2 * x)], axis=1)
     first = float(model.frequency or 0.0)
 
-    def rough(share):
-        """Lines of the model plus cubics, at a frequency, and what they leave."""
-        cubics = np.stack([shares * (1 - shares), shares * (1 - shares) * (1 - 2 * shares)], axis=1)
-        vibrating = model._replace(frequency=share * first)
+    def rough(ratio):
+        """Misfit of the lines of the model plus cubics at a frequency ratio, and these lines."""
+        vibrating = model._replace(frequency=ratio * first)
         found, left = [], 0.0
         tables = [run.static(vibrating, np.hstack([model.values, cubics])) for run in runs]
         sensors = model.values.shape[1]
@@ -92,24 +92,23 @@ def calibrate_influence_lines(case: Case, logs: Log | Sequence[Log]) -> Influenc
             )
             target = np.concatenate([run.centred(run.readings[:, s], s) for run in runs])
             sizes = np.linalg.norm(rows, axis=0)
-            x = np.linalg.lstsq(rows / sizes, target, rcond=None)[0] / sizes
-            left += float(np.sum((rows @ x - target) ** 2) / np.sum(target**2))
-            found.append(np.hstack([model.values[:, [s]], cubics]) @ x)
+            factors = np.linalg.lstsq(rows / sizes, target, rcond=None)[0] / sizes
+            left += float(np.sum((rows @ factors - target) ** 2) / np.sum(target**2))
+            found.append(np.hstack([model.values[:, [s]], cubics]) @ factors)
         return left, vibrating._replace(values=np.stack(found, axis=1))
 
-    start = min(FREQUENCY_SHARES.tolist(), key=lambda share: rough(share)[0])
-    share = scipy.optimize.minimize_scalar(
-        lambda share: rough(share)[0], bounds=(0.97 * start, 1.03 * start), method="bounded",
+    start = min(FREQUENCY_RATIOS.tolist(), key=lambda ratio: rough(ratio)[0])
+    ratio = scipy.optimize.minimize_scalar(
+        lambda ratio: rough(ratio)[0], bounds=(0.97 * start, 1.03 * start), method="bounded",
         options={"xatol": 1e-4},
     ).x  # fmt: skip
-    lines = _with_peaks(rough(share)[1], runs)
-    guess = _Problem(model, lines, runs)
-    shares = guess.best_shares()
-    # Again with dynamic wheel forces as noise, which a rough road takes for vibration else.
+    lines = _with_peaks(rough(ratio)[1], runs)
+    logs_of_first = _Problem(model, lines, runs).best_logs()
+    # Again with dynamic wheel forces as noise: those of a rough road would pass for vibration.
     for mode in range(len(lines.modes)):
-        lines = _tuned(lines, mode, lambda one: _Problem(model, one, runs).solved(shares))
+        lines = _tuned(lines, mode, lambda one: _Problem(model, one, runs).solved(logs_of_first))
     last = _Problem(model, lines, runs)
-    return last.lines(last.best_shares())
+    return last.lines(last.best_logs())
 
 
 def _with_peaks(lines: InfluenceLines, runs: "list[_Run]") -> InfluenceLines:
@@ -151,7 +150,7 @@ def _tuned(lines: InfluenceLines, mode: int, solved) -> InfluenceLines:
 
 
 class _Run:
-    """A calibration run: readings of sensors, and the axles that are known."""
+    """Calibration run: readings of sensors, and the given axles."""
 
     def __init__(self, case: Case, log: Log):
         loads = case.loads if log.loads is None else tuple(log.loads)
@@ -184,7 +183,7 @@ class _Run:
         )
 
     def fitted(self, lines: InfluenceLines) -> Float[np.ndarray, "time sensor"]:
-        """Readings, but for offsets, by lines."""
+        """Readings of the given axles by influence lines, without offsets of the sensors."""
         return self.static(lines, lines.values)
 
     def rows(self, table, sensor):
@@ -192,7 +191,7 @@ class _Run:
         return table[self.valid[:, sensor]] / self.noise[sensor]
 
     def centred(self, table, sensor):
-        """These less their mean."""
+        """Valid rows of a table in units of the noise, less their mean."""
         rows = self.rows(table, sensor)
         return rows - rows.mean(axis=0)
 
@@ -208,7 +207,7 @@ def _vehicle(case: Case, load, times) -> tuple[AxleGeometry, Float[np.ndarray, "
 
 
 class _Solution(NamedTuple):
-    """Numbers of least squares, their covariance, and the deviance of the shares."""
+    """Least-squares parameters, their covariance, and the restricted deviance."""
 
     numbers: Float[np.ndarray, " number"]
     covariance: Float[np.ndarray, "number number"]
@@ -216,7 +215,10 @@ class _Solution(NamedTuple):
 
 
 class _Problem:
-    """Mixed model of all runs and sensors together, for the waves and vibration of rough lines."""
+    """Mixed model of influence lines for all runs and sensors, with dynamic wheel forces as noise.
+
+    Waves of dynamic forces and vibration are computed by the lines of the `start`.
+    """
 
     def __init__(self, model: InfluenceLines, start: InfluenceLines, runs: list[_Run]):
         self.start, self.sensors = start, model.values.shape[1]
@@ -253,7 +255,7 @@ class _Problem:
         self.weighted = functools.lru_cache(maxsize=64)(self._weighted)
 
     def _weighted(self, log_share: float):
-        """Squares of numbers and readings, and the determinant of the covariance, at a share."""
+        """Gram matrix of parameters and readings, and log-determinant of the covariance, at a d."""
         gram, determinant = 0.0, 0.0
         for counted, (rows, dynamic) in zip(self.counted, self.parts, strict=True):
             factor = np.linalg.cholesky(np.eye(len(rows)) + np.exp(2 * log_share) * dynamic)
@@ -267,7 +269,7 @@ class _Problem:
         return gram, determinant
 
     def solved(self, logs) -> _Solution:
-        """Numbers at logarithms of the share of dynamic forces, and of the stiffness."""
+        """Solution at the logarithms of d (dynamic over static forces), and of the stiffness."""
         gram, determinant = self.weighted(round(float(logs[0]), 3))
         stiffness = np.exp(logs[1])
         normal = gram[:-1, :-1] + stiffness * self.penalty
@@ -282,9 +284,9 @@ class _Problem:
         level = max(squares / self.freedom, 1.0)
         return _Solution(numbers / size, inverse * level, float(deviance))
 
-    def best_shares(self) -> Float[np.ndarray, "2"]:
-        """Logarithms of the greatest restricted likelihood."""
-        limits = np.log([SHARES, STIFFNESSES])
+    def best_logs(self) -> Float[np.ndarray, "2"]:
+        """Logarithms of d and of the stiffness that maximise the restricted likelihood."""
+        limits = np.log([DYNAMIC_LIMITS, STIFFNESSES])
         stiffnesses = np.linspace(limits[1, 0], limits[1, 1], 7)
 
         def best(log_share):
@@ -300,7 +302,7 @@ class _Problem:
         return np.array([share, best(share)[1]])
 
     def lines(self, logs) -> InfluenceLines:
-        """Lines with their deviations."""
+        """Influence lines with their deviations, at logarithms of d and of the stiffness."""
         found = self.solved(logs)
         sizes, vectors = np.linalg.eigh(found.covariance)
         kept = sizes > KEPT * sizes.max()

@@ -84,7 +84,7 @@ def axles_of_pulses(
 
 
 def _train(first, second, i: int, k: int, speed: float) -> list[tuple[int, int]]:
-    """Pairs of pulses, of one vehicle with this one, that are as late at the second detector."""
+    """Pairs of pulses of the vehicle of pair (i, k), with equal delays between the detectors."""
     delay, pairs = second[k] - first[i], [(i, k)]
     for way in (1, -1):
         last, at = first[i], i + way
@@ -101,7 +101,7 @@ def _train(first, second, i: int, k: int, speed: float) -> list[tuple[int, int]]
 def _vehicle(first, second, places: tuple[float, float], length: float) -> AxleGeometry:
     """Axles of one vehicle from times (s) at both detectors."""
     speed = (places[1] - places[0]) / float(np.mean(second - first))
-    # Of each axle the times at which it enters the beam, by both detectors.
+    # Entry time of each axle, from both detectors.
     start = 0.0 if speed > 0 else length
     entries = (first - (places[0] - start) / speed + second - (places[1] - start) / speed) / 2
     offsets = abs(speed) * (entries - entries[0])

@@ -12,9 +12,9 @@ from jaxbeam.runtime.printer import text_table
 from tuning.weighing.unit_force import UnitForce, driven
 
 POINTS = 81  # equally spaced, and one at each sensor, where lines of strain have a kink
-# The bridge vibrates in as many modes as hold this share of the squares of its influence lines, and
-# in those that dynamic wheel forces drive, below a frequency (Hz); in so many at most.
-MODE_SHARE, DRIVEN, MODES = 0.8, 22.0, 3
+# The bridge vibrates in as many modes as have this fraction of the squares of its influence lines,
+# and in modes that dynamic wheel forces excite, below a frequency (Hz); at most in MODES.
+MODE_FRACTION, DRIVEN, MODES = 0.8, 22.0, 3
 USUAL_SHARE = 0.07  # of dynamic wheel forces in the static ones, on an average road
 FORMAT = "jaxbeam influence lines 2"
 
@@ -41,10 +41,10 @@ class InfluenceLines(NamedTuple):
     """Readings of sensors (SI unit per newton downwards) with a force at positions (m).
 
     `deviations` of calibrated lines are independent of each other, of one standard deviation each:
-    their products sum to the covariance of all ordinates. The bridge vibrates about what the lines
-    tell in modes of these `shapes`, of `ratios` times the first `frequency` (Hz), and
-    `damping_ratios`; without a frequency it does not. Dynamic wheel forces on its road are about
-    `dynamic_share` of the static ones (standard deviation).
+    their products sum to the covariance of all ordinates. The bridge vibrates about the static
+    readings in modes of these `shapes`, of `ratios` times the first `frequency` (Hz), and
+    `damping_ratios`; without a frequency it does not vibrate. Dynamic wheel forces on its road are
+    about `dynamic_share` of the static ones (standard deviation).
 
     >>> import numpy as np
     >>> import tuning
@@ -190,7 +190,7 @@ def lines_from_dict(content: dict) -> InfluenceLines:
 
 
 class _Mode(NamedTuple):
-    """z'' + 2 zeta w z' + w^2 z = w^2 s for a mode of a shape, of which `parts` is in a line."""
+    """Mode z'' + 2 zeta w z' + w^2 z = w^2 s; `parts` are its weights in an influence line."""
 
     positions: Float[np.ndarray, " point"]
     shape: Float[np.ndarray, " point"]
@@ -199,7 +199,7 @@ class _Mode(NamedTuple):
     parts: Float[np.ndarray, " point"]
 
     def swing(self, since: Float[np.ndarray, "*time"], speed: float) -> Float[np.ndarray, "*time"]:
-        """Response z less the static one s to a force that crosses, since its entry (s)."""
+        """Dynamic part z - s of the response to a crossing force, at times (s) since its entry."""
         passage = float(self.positions[-1]) / abs(speed)
         last = max(float(since.max()), passage)
         fine = min(passage / 200, 1 / (24 * self.frequency), last / 8)
@@ -215,7 +215,7 @@ class _Mode(NamedTuple):
     def motion(
         self, force: Float[np.ndarray, "time number"], step: float
     ) -> Float[np.ndarray, "time number"]:
-        """Motion z by forces s at equal steps (s), from rest."""
+        """Response z from rest to forces s at equal steps (s)."""
         w, damping = 2 * np.pi * self.frequency, self.damping_ratio
         pole = complex(-damping * w, w * np.sqrt(1 - damping**2))
         # z is the imaginary part of the response of one pole to w^2 / w_d times the force.
@@ -223,7 +223,7 @@ class _Mode(NamedTuple):
 
 
 def _interpolated(x, points, table: Float[np.ndarray, "point number"]):
-    """Columns at x of a table at points."""
+    """Columns of a table at points, interpolated at x."""
     return np.stack([np.interp(x, points, column) for column in table.T], axis=1)
 
 
@@ -231,8 +231,8 @@ def _interpolated(x, points, table: Float[np.ndarray, "point number"]):
 def model_influence_lines(case: Case) -> InfluenceLines:
     """Influence lines of a case at points, linear in between, and its first modes.
 
-    Those of moments and the like are corrected statically; those of deflections are sums of the
-    modes of the case.
+    Lines of moments and other section forces are corrected statically; lines of deflections are
+    sums of the modes of the case.
 
     Raises ValueError for a sensor of velocity or acceleration, and a beam that can move as a rigid
     body.
@@ -281,7 +281,7 @@ def _first_modes(case: Case, positions: Float[np.ndarray, " point"]) -> tuple:
     unit_force = UnitForce(case, 1.0)
     values = unit_force.readings(unit_force.length, positions / unit_force.length)
     count, left = 0, np.inf
-    while count < MODES and left > 1 - MODE_SHARE:
+    while count < MODES and left > 1 - MODE_FRACTION:
         count += 1
         modes = unit_force.modes(positions, count)
         rest = values - modes[1] @ np.linalg.lstsq(modes[1], values, rcond=None)[0]

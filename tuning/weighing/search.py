@@ -1,4 +1,4 @@
-"""Speed, entry time and distances of axles in readings, without a guess of any of them.
+"""Search for speed, entry time and distances of axles in readings, without initial guesses.
 
 Readings of two sensors are y_1 = u_1 * F and y_2 = u_2 * F, with the readings u of one force that
 crosses at a speed, and the train of axles F: at the right speed y_1 * u_2 = y_2 * u_1, whatever the
@@ -30,17 +30,17 @@ from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
 SPEED_STEP, SINGLE_STEP = 0.01, 0.04  # of the speeds tried, relative; with a single sensor
 NEAR = 0.97, 0.985, 1.0, 1.015, 1.03  # times this speed, tried by combs
-SPACING, SPACING_SHARE = 0.35, 0.05  # m, between the forces of combs; of a beam at most
+SPACING, SPACING_FRACTION = 0.35, 0.05  # m, between the forces of combs; of a beam at most
 MOST_AXLES = 9  # of a comb: the heaviest
-JOINED = 15 / 7  # times that, between forces of one axle: 0.75 m
-LEAST_SHARE = 0.1  # of the heaviest axle of a comb, in the others
+JOINED = 15 / 7  # spacings of a comb between forces of one axle: 0.75 m
+LEAST_AXLE = 0.1  # force of an axle of a comb over that of the heaviest
 ROUNDS = 2  # of fewer and of more axles
-LEAST_GAIN = 1.0  # of the criterion, by other axles
-TRIED = 3  # changes that are fitted, of all
-COMBS = 3  # one after the other
-FREQUENCY_SHARES = np.linspace(0.85, 1.15, 121)  # of that of the lines, tried in free vibration
-MIN_CYCLES = 3.0  # of free vibration that tell its frequency
-MIN_EXPLAINED = 0.5  # share of its energy that one decaying mode explains
+LEAST_GAIN = 1.0  # decrease of the criterion for which a change of axles is kept
+TRIED = 3  # best changes, which are fitted
+COMBS = 3  # fitted one after the other
+FREQUENCY_RATIOS = np.linspace(0.85, 1.15, 121)  # to that of the lines, tried in free vibration
+MIN_CYCLES = 3.0  # of free vibration from which its frequency is found
+MIN_EXPLAINED = 0.5  # fraction of its energy that one decaying mode explains
 AT_EXIT = 0.1  # of the largest mean over two cycles, below which nothing is on the bridge
 MAX_ROWS = 600  # samples of all sensors in a comb
 # Of two combs at once: speeds, relative; m; samples.
@@ -48,7 +48,7 @@ PAIR_STEP, PAIR_SPACING, PAIR_ROWS = 0.06, 0.7, 300
 
 
 class _Comb(NamedTuple):
-    """Misfit of a comb (share of the variance), its speed, and places (m) of its forces (N)."""
+    """Comb of forces: misfit (fraction of the variance), speed (m/s), places (m), forces (N)."""
 
     misfit: float
     speed: float
@@ -63,14 +63,14 @@ def find_axles(
     both_ways: bool = False,
     number: int | None = None,
 ) -> tuple[dict[int, AxleFit], dict[int, float]]:
-    """The best fits of some numbers of axles, a number among them if it is given.
+    """Best fits by number of axles, and criteria of all numbers that were tried.
 
-    With them the criteria of all numbers that were tried. `speeds` (m/s) are the lowest and highest
-    possible ones, from the left or, with `both_ways`, in both directions. Empty if nothing crosses.
+    The fits include the given `number`, if any. `speeds` (m/s) are the lowest and highest possible
+    ones, from the left or, with `both_ways`, in both directions. Empty if nothing crosses.
     """
     comb = _best_comb(lines, log, speeds, both_ways)
     fit, fits, tried = None, {}, {}
-    for _ in range(COMBS):  # at the weights of the fit before
+    for _ in range(COMBS):  # with the weights of the previous fit
         places, forces = _axles_of(comb, _spacing(lines))
         if places.size == 0:
             return {}, {}
@@ -80,8 +80,8 @@ def find_axles(
         own = fit_axles(lines, start, forces, log, fit and fit.weights)
         if fit is None or own.criterion < fit.criterion:
             fit = own
-        known = fits.get(own.forces.size)
-        if known is None or own.criterion < known.criterion:
+        former = fits.get(own.forces.size)
+        if former is None or own.criterion < former.criterion:
             fits[own.forces.size] = own
         comb = _weighted_comb(fit, log)
     assert fit is not None
@@ -91,7 +91,7 @@ def find_axles(
         best = _changed(_Trial.of(fit), change, fit, log)
         fit = fits[best.forces.size] = fit_axles(lines, *best[1:], log, fit.weights)
     less, more = _with_one_less, _with_one_more
-    # Of a known number that is so again after each pair.
+    # A given number is kept by pairs of changes.
     changes = ((less, more), (more, less)) if number else ((less,), (more,))
     for steps in ROUNDS * (*changes, (_with_one_moved,)):
         while fit.forces.size > 1 or steps[0] is more:
@@ -112,12 +112,12 @@ def find_axles(
 
 
 def most_likely(fits: dict[int, AxleFit]) -> AxleFit:
-    """The fit of the most likely number of axles."""
+    """Fit with the most likely number of axles."""
     return min(fits.values(), key=lambda fit: (not fit.is_plausible, fit.criterion))
 
 
 class _Trial(NamedTuple):
-    """Axles tried with the weights of a fit, and their criterion."""
+    """Trial axles with the weights of a fit, and their criterion."""
 
     criterion: float
     geometry: AxleGeometry
@@ -129,7 +129,7 @@ class _Trial(NamedTuple):
 
 
 def _changed(trial: _Trial, change, fit: AxleFit, log: CrossingLog) -> _Trial:
-    """The best of what a change makes of axles, with the weights of a fit."""
+    """Best trial after a change of the axles of a trial, with the weights of a fit."""
     speed, ranked = trial.geometry.speed, []
     for places in change(trial.geometry.offsets, trial.forces):
         entry = trial.geometry.entry_time + places[0] / abs(speed)
@@ -145,7 +145,7 @@ def _changed(trial: _Trial, change, fit: AxleFit, log: CrossingLog) -> _Trial:
 
 
 def _with_one_less(places, forces) -> list[np.ndarray]:
-    """Places of axles of which one is left out, or joined with the next."""
+    """Trial places with one axle fewer: one is left out, or joined with the next."""
     trials = []
     for i in range(places.size):
         trials.append(np.delete(places, i))
@@ -158,7 +158,7 @@ def _with_one_less(places, forces) -> list[np.ndarray]:
 
 
 def _with_one_more(places, forces) -> list[np.ndarray]:
-    """Places of axles of which one, or a group, is a group of one more."""
+    """Trial places with one axle more: one axle, or a group, becomes a group of one more."""
     trials = []
     for group in axle_groups(places):
         for own in [group] if len(group) == 1 else [group, *([i] for i in group)]:
@@ -169,7 +169,7 @@ def _with_one_more(places, forces) -> list[np.ndarray]:
 
 
 def _with_one_moved(places, forces) -> list[np.ndarray]:
-    """Places of as many axles, of which one is left out and another is a group of one more."""
+    """Trial places with one axle moved: one is left out, and a group gets one more."""
     trials = []
     for i in range(places.size):
         trials += _with_one_more(np.delete(places, i), np.delete(forces, i))
@@ -177,7 +177,7 @@ def _with_one_moved(places, forces) -> list[np.ndarray]:
 
 
 def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool) -> _Comb:
-    """The comb of the best speed."""
+    """Comb of the best speed."""
     stride = max(log.times.size * log.readings.shape[1] // MAX_ROWS, 1)
     times, readings = log.times[::stride], log.readings[::stride]
     scale, spacing = np.maximum(readings.std(axis=0), 1e-300), _spacing(lines)
@@ -247,7 +247,7 @@ def two_trains(
 
 
 def _weighted_comb(fit: AxleFit, log: CrossingLog) -> _Comb:
-    """The comb of the best speed near that of a fit, with its weights."""
+    """Comb of the best speed near that of a fit, with the weights of the fit."""
     shifts, target = fit.weights(log.shifts), fit.weights(log.target)
     basis, spacing = np.linalg.qr(shifts)[0], _spacing(fit.lines)
 
@@ -265,7 +265,7 @@ def _weighted_comb(fit: AxleFit, log: CrossingLog) -> _Comb:
 
 
 def _cross_relation(lines: InfluenceLines, times, readings, speed: float) -> float:
-    """Share of y_1 * u_2 - y_2 * u_1 of all pairs of sensors in the squares of its terms."""
+    """Squares of y_1 * u_2 - y_2 * u_1 of all pairs of sensors over the squares of its terms."""
     still = AxleGeometry(speed, float(times[0]), np.zeros(1), lines.length)
     unit = lines.crossing(still, times)[:, 0]
     size = 2 * times.size
@@ -278,12 +278,12 @@ def _cross_relation(lines: InfluenceLines, times, readings, speed: float) -> flo
 
 
 def _spacing(lines: InfluenceLines) -> float:
-    """Distance (m) of the forces of combs on a beam."""
-    return min(SPACING, SPACING_SHARE * float(lines.length))
+    """Spacing (m) of the forces of combs on a beam."""
+    return min(SPACING, SPACING_FRACTION * float(lines.length))
 
 
 def _axles_of(comb: _Comb, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places and forces of the axles of a comb: of neighbours the centre, the heaviest of all."""
+    """Places (m) and forces (N) of the heaviest axles of a comb; neighbouring forces are joined."""
     if comb.places.size == 0:
         return comb.places, comb.forces
     parts = np.flatnonzero(np.diff(comb.places) > JOINED * spacing) + 1
@@ -291,7 +291,7 @@ def _axles_of(comb: _Comb, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     forces = np.array([comb.forces[own].sum() for own in groups])
     places = np.array([np.average(comb.places[own], weights=comb.forces[own]) for own in groups])
     order = np.argsort(-forces)[:MOST_AXLES]
-    order = np.sort(order[forces[order] > LEAST_SHARE * forces.max()])
+    order = np.sort(order[forces[order] > LEAST_AXLE * forces.max()])
     return places[order], forces[order]
 
 
@@ -300,9 +300,9 @@ def with_free_frequency(
     times: Float[np.ndarray, " time"],
     readings: Float[np.ndarray, "time sensor"],
 ) -> InfluenceLines:
-    """Calibrated lines with the first frequency that the free vibration after a crossing tells.
+    """Calibrated lines with the first frequency found in the free vibration after a crossing.
 
-    Slow runs, by which lines are calibrated, tell little of it.
+    Slow runs, by which lines are calibrated, contain little vibration.
     """
     if lines.deviations is None or lines.frequency is None:
         return lines
@@ -339,5 +339,5 @@ def _free_frequency(
         basis = np.linalg.qr(np.stack([wave.real, wave.imag, np.ones(since.size)], axis=1))[0]
         return float(np.sum((basis.T @ rest) ** 2) / max(np.sum(rest**2), 1e-300))
 
-    best = max((first * FREQUENCY_SHARES).tolist(), key=explained)
+    best = max((first * FREQUENCY_RATIOS).tolist(), key=explained)
     return best if explained(best) > MIN_EXPLAINED else first
