@@ -1,10 +1,9 @@
 """Axles from the pulses of two detectors across the road, as in weighing with nothing on the road.
 
 Strain gauges under the deck, tubes, loops or piezoelectric strips give a pulse for each axle. The
-pulses of a vehicle come to the second detector as they came to the first, later by one delay: the
-cross-correlation of both trains of pulses has its peak there, and its sign is the direction. A
-train of pulses whose delay most others share is taken out, and so on: vehicles may overtake or
-meet.
+pulses of a vehicle reach the second detector in the pattern of the first, later by one delay: the
+peak of the cross-correlation of both signals. The sign of the delay is the direction. The largest
+set of pulses with one delay is removed as a vehicle, then the next: vehicles may overtake or meet.
 """
 
 import numpy as np
@@ -13,16 +12,18 @@ from jaxtyping import Float
 
 from tuning.weighing.influence_lines import AxleGeometry
 
-LEAST_PULSE = 6.0, 0.15  # times the noise; share of the largest pulse
+LEAST_PULSE = 6.0, 0.15  # smallest pulse: times the noise; fraction of the largest pulse
 MOST_GAP = 12.0  # m, between the axles of one vehicle
-LEAST_GAP = 0.6  # m
+LEAST_GAP = 0.6  # m, between axles
 TOLERANCE = 0.2  # m, of the place of an axle, by a varying speed and the width of pulses
 
 
 def pulse_times(
     times: Float[np.ndarray, " time"], signal: Float[np.ndarray, " time"], apart: float
 ) -> Float[np.ndarray, " pulse"]:
-    """Times (s) of the pulses of a detector, of either sign, with some seconds between them.
+    """Times (s) of the pulses of a detector, of either sign, at least `apart` (s) from each other.
+
+    `times` (s) are those of the samples of the `signal`, whose unit does not matter.
 
     >>> times = np.arange(200) / 100
     >>> signal = np.exp(-(((times - 0.502) / 0.02) ** 2))
@@ -31,7 +32,7 @@ def pulse_times(
     """
     step = float(times[-1] - times[0]) / (times.size - 1)
     level = signal - np.median(signal)
-    # Pulses stand out of the deck's slow bending.
+    # A median filter removes the slow bending of the deck and leaves the pulses.
     wide = max(2 * round(apart / step) + 1, 5)
     level = level - scipy.signal.medfilt(level, min(2 * wide + 1, level.size - 1 | 1))
     level *= np.sign(level[np.argmax(np.abs(level))])
@@ -50,7 +51,7 @@ def axles_of_pulses(
     speeds: tuple[float, float],
     length: float,
 ) -> list[AxleGeometry]:
-    """Vehicles from times (s) of pulses of two detectors at places (m) on a beam of a length (m).
+    """Axles of vehicles from `pulses` (s) of two detectors at `places` (m) on a beam of a `length`.
 
     `speeds` (m/s) are the lowest and highest ones, in both directions. Pulses that have no partner
     at the other detector are left out.
@@ -72,7 +73,7 @@ def axles_of_pulses(
                     continue
                 pairs = _train(first, second, i, k, abs(apart / delay))
                 delays = np.array([second[b] - first[a] for a, b in pairs])
-                # Of equally many pairs those whose delays are most alike.
+                # Among sets of equally many pairs, the one with the smallest spread of delays.
                 score = len(pairs) - float(delays.std()) * abs(apart / delay) / TOLERANCE / 2
                 if score > best[0]:
                     best = score, pairs
@@ -84,7 +85,7 @@ def axles_of_pulses(
 
 
 def _train(first, second, i: int, k: int, speed: float) -> list[tuple[int, int]]:
-    """Pairs of pulses of the vehicle of pair (i, k), with equal delays between the detectors."""
+    """Indices of pairs of pulses with about the delay of pair (i, k): the axles of a vehicle."""
     delay, pairs = second[k] - first[i], [(i, k)]
     for way in (1, -1):
         last, at = first[i], i + way
@@ -99,7 +100,7 @@ def _train(first, second, i: int, k: int, speed: float) -> list[tuple[int, int]]
 
 
 def _vehicle(first, second, places: tuple[float, float], length: float) -> AxleGeometry:
-    """Axles of one vehicle from times (s) at both detectors."""
+    """Axles of one vehicle from the times (s) of its pulses at both detectors."""
     speed = (places[1] - places[0]) / float(np.mean(second - first))
     # Entry time of each axle, from both detectors.
     start = 0.0 if speed > 0 else length

@@ -1,8 +1,8 @@
 """Traffic over a bridge: a table of vehicles from long logs, each weighed once.
 
-Parts of a log with something on the bridge are those in which a reading, smoothed over two cycles
-of the first mode, is larger than that of a light vehicle, and than noise. The level of a sensor,
-which drifts with temperature, is the median of a minute or more.
+A bridge is loaded where a reading, smoothed over two cycles of the first mode, exceeds that of a
+light vehicle, and the noise. The level of a sensor, which drifts with temperature, is the median of
+a minute or more.
 """
 
 import dataclasses
@@ -39,16 +39,17 @@ FORMAT = "jaxbeam vehicles 1"
 LEAST_WEIGHT = 35e3  # N, of vehicles that are weighed: lorries, by the usual limit of 3.5 t
 LEAST_READING = 0.25  # times the largest ordinate and this weight, of a vehicle of some axles
 NOISE = 6.0  # times the deviation of a smoothed reading, above which something is on the bridge
-LEVEL, PASSAGES = 60.0, 12.0  # s, and passages of the slowest vehicle, of a median
+# Shortest time of a median for the level of a sensor: s, and passages of the slowest vehicle.
+LEVEL, PASSAGES = 60.0, 12.0
 LONGEST = 20.0  # m, of a vehicle
-AFTER = 2.0  # s of free vibration after a vehicle, which tell its frequency
-BEFORE = 0.6  # s
+AFTER = 2.0  # s of free vibration after a vehicle, from which its frequency is estimated
+BEFORE = 0.6  # s of readings before a vehicle
 MAX_LISTED = 20  # vehicles, in the text
 
 
 @dataclasses.dataclass(frozen=True)
 class TrafficSettings:
-    """How vehicles are found in logs.
+    """Settings of the search for vehicles in logs.
 
     `speeds` (m/s) are the lowest and highest ones, in both directions or, without `both_ways`, from
     the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
@@ -72,15 +73,15 @@ class TrafficSettings:
         if len(self.detectors) not in (0, 2) or len(set(self.detectors.values())) == 1:
             raise ValueError(
                 f"there must be two detectors of axles at two positions, or none, not"
-                f" {len(self.detectors)}: they tell speeds by the time between them"
+                f" {len(self.detectors)}: a speed is their distance over the time between them"
             )
 
 
 class WeighedVehicle(NamedTuple):
-    """A vehicle that was weighed: SI units, half widths of 95 % intervals.
+    """Vehicle weighed: speed, axles, forces (SI units), and half widths of their 95 % intervals.
 
     `time` (s) is that at which the first axle enters the bridge, in the log of the name `file`;
-    `stamp` its date and time, "" if the log has none. At a negative speed it came from the right.
+    `stamp` its date and time, "" if the log has none. A negative speed is from right to left.
     `doubt` is a sentence on why the weights may be wrong, "" if there is none.
 
     >>> loads, errors = [6e4, 9e4], [1e3, 2e3]
@@ -103,13 +104,13 @@ class WeighedVehicle(NamedTuple):
 
     @property
     def silhouette(self) -> str:
-        """Numbers of axles in the groups of the vehicle, from the front: its class, as "1-1-3"."""
+        """Class of the vehicle: numbers of axles in its groups from the front, as "1-1-3"."""
         return "-".join(map(str, self.groups))
 
 
 @dataclasses.dataclass(frozen=True)
 class WeighedTraffic(TableViews):
-    """Vehicles in the order of time, and what was passed over, by the names of logs.
+    """Vehicles in the order of time, and sentences on parts of logs that were not weighed.
 
     >>> print(WeighedTraffic(()).verdict)
     no vehicle is found
@@ -120,7 +121,7 @@ class WeighedTraffic(TableViews):
 
     @property
     def verdict(self) -> str:
-        """How many vehicles there are, and their weights."""
+        """Sentence on the number, directions and weights of the vehicles."""
         count = len(self.vehicles)
         if not count:
             return "no vehicle is found"
@@ -136,7 +137,7 @@ class WeighedTraffic(TableViews):
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns by head, a row for each vehicle; axles that it has not are NaN."""
+        """Columns by head, a row for each vehicle; NaN for axles that it does not have."""
         rows = self.vehicles
         most = max((len(one.forces) for one in rows), default=0)
 
@@ -194,7 +195,7 @@ class WeighedTraffic(TableViews):
 
 
 class Passing(NamedTuple):
-    """A part of a log with something on the bridge (s), and what speaks against weighing it."""
+    """Start and end (s) of a part of a log with a loaded bridge; why it cannot be weighed."""
 
     start: float
     end: float
@@ -207,7 +208,9 @@ def passings(
     readings: Float[np.ndarray, "time sensor"],
     settings: TrafficSettings,
 ) -> list[Passing]:
-    """Parts of readings with something on the bridge.
+    """Parts of readings in which the bridge is loaded, in the order of time.
+
+    `lines` are the influence lines of the sensors, `times` (s) those of the `readings` (SI units).
 
     >>> import numpy as np
     >>> lines = InfluenceLines(np.array([0.0, 5, 10]), np.array([[0.0], [-1e-8], [0]]))
@@ -263,7 +266,7 @@ def weigh_vehicles(
     settings: TrafficSettings,
     influence_lines: InfluenceLines | None = None,
 ) -> WeighedTraffic:
-    """All vehicles that crossed a known beam in a log, one by one or several at once.
+    """Table of all vehicles that crossed the beam of a case in a log, alone or several at once.
 
     The `influence_lines` are by default those of the case (see `calibrate_influence_lines`). Loads
     and profile of case and log are not used.
@@ -302,7 +305,7 @@ def weigh_logs(
     read: Callable[[Path], Log] = read_log,
     progress: bool = False,
 ) -> WeighedTraffic:
-    """All vehicles in some log files, of which those in the `store` are not weighed again.
+    """Table of all vehicles in log files; those in the `store` are not weighed again.
 
     See `weigh_vehicles`, also for `influence_lines`. A line is added to the store, a text file,
     after each vehicle; logs that have changed are weighed again. `read` reads a log from its file;
@@ -330,13 +333,13 @@ def weigh_logs(
     store, lines = Path(store), lines_for(case, influence_lines)
     if not store.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
-    known = _Store.opened(store, _mark_of(case, lines, settings))
+    stored = _Store.opened(store, _mark_of(case, lines, settings))
     paths, problems = [Path(path) for path in logs], []
-    kept = keeping(lambda: f"{len(known.found)} passings are in {store}: go on by the same")
+    kept = keeping(lambda: f"{len(stored.found)} passings are in {store}: go on by the same")
     with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
         for path in paths:
             name = f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}"
-            if name not in known.whole:
+            if name not in stored.whole:
                 try:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", LogWarning)
@@ -346,22 +349,22 @@ def weigh_logs(
                     bar.update()
                     continue
                 for number, one in enumerate(record.passings):
-                    if f"{name} {number}" not in known.found:
-                        known.add(f"{name} {number}", *record.weighed(one))
-                known.add(name, [], [], whole=len(record.passings))
+                    if f"{name} {number}" not in stored.found:
+                        stored.add(f"{name} {number}", *record.weighed(one))
+                stored.add(name, [], [], whole=len(record.passings))
             bar.update()
     names = [f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}" for path in paths]
     parts = [
-        known.found[f"{name} {number}"]
+        stored.found[f"{name} {number}"]
         for name in names
-        for number in range(known.whole.get(name, 0))
+        for number in range(stored.whole.get(name, 0))
     ]
     found = _traffic(parts)
     return dataclasses.replace(found, problems=(*found.problems, *problems))
 
 
 class _Record(NamedTuple):
-    """A log with the readings of its sensors and detectors, and where something passes."""
+    """Log with the readings of its sensors and detectors, and its parts with a loaded bridge."""
 
     name: str
     start: str
@@ -375,7 +378,7 @@ class _Record(NamedTuple):
 
     @classmethod
     def of(cls, case: Case, lines: InfluenceLines, log: Log, settings: TrafficSettings):
-        """The record of a log. Raises ValueError for a detector that it has not."""
+        """Record of a log. Raises ValueError for a detector that the log does not have."""
         signals, others = [], list(range(len(log.names)))
         for name, position in settings.detectors.items():
             if name not in log.names:
@@ -395,7 +398,7 @@ class _Record(NamedTuple):
         )  # fmt: skip
 
     def weighed(self, passing: Passing) -> tuple[list[WeighedVehicle], list[str]]:
-        """Vehicles of a part of the log, and sentences on what was not weighed."""
+        """Vehicles of a part of the log, and sentences on why it was not weighed."""
         when = self._stamp(passing.start) or f"{passing.start:.2f} s"
         about = f"{self.name}, {when}: "
         if passing.problem:
@@ -448,17 +451,17 @@ class _Record(NamedTuple):
 
 
 def _traffic(parts: Iterable[tuple[list[WeighedVehicle], list[str]]]) -> WeighedTraffic:
-    """Table of what was found in parts of logs."""
+    """Table of the vehicles and problems found in parts of logs."""
     vehicles: list[WeighedVehicle] = []
     problems = []
-    for found, told in parts:
+    for found, more_problems in parts:
         vehicles += found
-        problems += told
+        problems += more_problems
     return WeighedTraffic(tuple(vehicles), tuple(problems))
 
 
 class _Store(NamedTuple):
-    """What was found so far: vehicles and problems of each passing, numbers of these in a log."""
+    """Store of vehicles: vehicles and problems by passing, number of passings by finished log."""
 
     path: Path
     found: dict[str, tuple[list[WeighedVehicle], list[str]]]
@@ -466,7 +469,7 @@ class _Store(NamedTuple):
 
     @classmethod
     def opened(cls, path: Path, mark: str):
-        """The store in a file, which is begun if there is none; a broken last line is dropped.
+        """Store in a file, which is created if it is missing; a broken last line is dropped.
 
         Raises ValueError for a file that is no store, or of another case, lines or settings.
         """
@@ -495,7 +498,7 @@ class _Store(NamedTuple):
     def add(
         self, passing: str, vehicles: list[WeighedVehicle], problems: list[str], whole=None
     ) -> None:
-        """Add a passing, or say that a log is done and has a number of them."""
+        """Append a passing, or the number `whole` of passings of a log that is finished."""
         entry: dict[str, Any] = {"passing": passing}
         if whole is None:
             self.found[passing] = vehicles, problems
@@ -507,7 +510,7 @@ class _Store(NamedTuple):
 
 
 def _entry(line: str) -> dict[str, Any]:
-    """The table of a line; empty for one that is broken off."""
+    """Entry of a line of the store; empty for an incomplete line."""
     try:
         found = json.loads(line)
     except json.JSONDecodeError:
@@ -516,7 +519,7 @@ def _entry(line: str) -> dict[str, Any]:
 
 
 def _mark_of(case: Case, lines: InfluenceLines, settings: TrafficSettings) -> str:
-    """What tells weighings of other lines, sensors or settings apart."""
+    """Hash of influence lines, sensor quantities and settings, which identifies a store."""
     about = dataclasses.asdict(settings) | {"detectors": dict(settings.detectors)}
     sensors = [sensor.quantity for sensor in case.sensors]
     text = json.dumps([lines.to_dict(), sensors, about])

@@ -1,10 +1,10 @@
 """Vehicles on a beam in a part of a log: one by one, one behind the other, or meeting each other.
 
 The axles of one speed are found first (`search`). A gap too long for one vehicle separates two.
-If residuals are larger than noise and dynamic wheel forces, or these are larger than the road gives
-them, two combs of forces of two speeds are tried instead. Each vehicle is then weighed in what the
-others leave, whose numbers are taken for hardly known, so that its covariance is the marginal one.
-Two vehicles are taken if they are more likely than one. Detectors tell number and places of axles.
+If residuals exceed noise and dynamic wheel forces, or these forces exceed those of usual roads, two
+trains of axles of two speeds are tried instead. Each vehicle is then weighed in the readings less
+those of the others, whose parameters get a wide prior, so that its covariance is the marginal one.
+Two vehicles are taken if they are more likely than one. Detectors give number and places of axles.
 """
 
 import copy
@@ -19,9 +19,10 @@ from tuning.weighing.search import find_axles, most_likely, two_trains
 
 MOST_EXCESS = 1.5  # of the variance of residuals, above which axles or lines are unlikely
 MOST_SHARE = 2.0  # times the usual dynamic wheel forces
-ROUNDS = 2  # of weighing each vehicle in what the others leave
-NEAR = 0.88, 1.12  # times the speed of a vehicle, sought again
-SEEN, SEEN_SPEED = 0.05, 0.02  # m, of axles by detectors; of their speed, relative
+ROUNDS = 2  # of weighing each vehicle in the readings less those of the others
+NEAR = 0.88, 1.12  # range of speeds of a second search, over the speed of a vehicle
+# Standard deviations of places of axles by detectors (m), and of their speed (relative).
+SEEN, SEEN_SPEED = 0.05, 0.02
 
 
 def vehicles_in(
@@ -35,8 +36,8 @@ def vehicles_in(
     """Vehicles in a part of a log, in the order of their entries; empty if nothing crosses.
 
     `speeds` (m/s) are the lowest and highest ones, from the left or, with `both_ways`, in both
-    directions; `seen` are the axles that detectors told, if there are any. Of several vehicles,
-    those below the `least_weight` (N) are left out.
+    directions; `seen` are the axles by detectors, if there are any. Of several vehicles, those
+    below the `least_weight` (N) are left out.
 
     >>> import numpy as np
     >>> from tuning.weighing.axle_fit import CrossingLog
@@ -68,7 +69,10 @@ def vehicles_in(
 
 
 def _criterion(fits: list[AxleFit]) -> float:
-    """Criterion of all vehicles together: that of the last is given the others."""
+    """Criterion (see `AxleFit.criterion`) of all vehicles together; lower is better.
+
+    That of the last vehicle is conditional on the others; each of these adds its penalty.
+    """
     *others, last = fits
     more = [unlikeliness(fit.rows, fit.geometry.offsets, fit.forces) for fit in others]
     return last.criterion + sum(more)
@@ -77,7 +81,7 @@ def _criterion(fits: list[AxleFit]) -> float:
 def _weighed(
     log: CrossingLog, trains: list[AxleTrain], weigh, least_weight: float
 ) -> list[AxleFit]:
-    """Vehicles, each weighed in what the others leave."""
+    """Vehicles of trains, each weighed by `weigh` in the log less the readings of the others."""
     fits: list[AxleFit] = []
     for _ in range(ROUNDS if len(trains) > 1 else 1):
         fits = []
@@ -96,14 +100,14 @@ def _weighed(
 
 
 def _found_again(log: CrossingLog, train: AxleTrain) -> AxleFit | None:
-    """The axles of a vehicle, sought again near its speed."""
+    """Axles of a train, found again near its speed; None if there are none."""
     speed = train.geometry.speed
     fits, _ = find_axles(train.lines, log, (NEAR[0] * speed, NEAR[1] * speed))
     return most_likely(fits) if fits else None
 
 
 def _seen(log: CrossingLog, train: AxleTrain) -> AxleFit:
-    """The vehicle whose axles detectors told."""
+    """Vehicle fitted from the axles of a train, with their places by detectors as a prior."""
     at = train.geometry
     speed, more = abs(at.speed), at.offsets.size - 1
     log.seen = at, np.array([SEEN_SPEED * speed, SEEN / speed, *(SEEN * np.ones(more))])
@@ -111,7 +115,7 @@ def _seen(log: CrossingLog, train: AxleTrain) -> AxleFit:
 
 
 def _with_forces(log: CrossingLog, trains: list[AxleTrain]) -> list[AxleTrain]:
-    """Trains with the forces of least squares of all of them together."""
+    """Trains with axle forces (N) from one nonnegative least-squares problem."""
     if not trains:
         return []
     tables = [log.rows(one.lines.crossing(one.geometry, log.times)) for one in trains]
@@ -129,7 +133,7 @@ def _with_forces(log: CrossingLog, trains: list[AxleTrain]) -> list[AxleTrain]:
 
 
 def _separated(fit: AxleFit) -> list[AxleTrain]:
-    """The vehicles of a fit, which gaps separate."""
+    """Trains of the axles of a fit, separated at gaps too long for one vehicle."""
     at = fit.geometry
     cuts = np.flatnonzero(np.diff(at.offsets) > MOST_GAP) + 1
     found = []
