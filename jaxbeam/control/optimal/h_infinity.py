@@ -105,7 +105,7 @@ def is_attained(game: Game, level: Float[Array, ""]) -> Bool[Array, ""]:
 
 
 def least_level(game: Game) -> Float[Array, ""]:
-    """Least worst-case gain of any law, to a relative 1e-9.
+    """Smallest worst-case gain that a law can attain, to a relative 1e-9.
 
     Its derivative is that of the level at which the largest eigenvalue of S M is its square.
     Raises ValueError if there is none; under `jit` and `vmap` it is nan.
