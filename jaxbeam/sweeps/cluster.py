@@ -1,7 +1,7 @@
 """Sweeps on a Dask cluster: workers compute blocks and write them to the store.
 
 Only the path of the store and block numbers are sent. A worker makes the runner from the
-specification and step sizes in the store, and writes each block as a chunk of its own. Dask gives
+specification and step sizes in the store, and appends each block to a file of its own. Dask gives
 unfinished blocks of workers that die to other workers, which skip the blocks written already.
 """
 
@@ -128,9 +128,8 @@ def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[i
             " sweep; install the same everywhere"
         )
     compute = runner.block_function(block_store.steps[:-1])
-    for block in blocks:
-        if not block_store.is_done(block):
-            block_store.write(block, compute(block))
+    for block in block_store.missing(blocks):
+        block_store.write(block, compute(block))
     return blocks
 
 

@@ -51,20 +51,20 @@ def compute_sweep(
     """
     fingerprint = specification.fingerprint()
     runner, steps, error, block_store = _begun(specification, path, state, progress_bar)
-    missing = block_store.missing()
+    missing = block_store.missing(range(runner.block_count))
     remaining = sum(runner.run_count(block) for block in missing)
     progress_bar.skip(specification.count - remaining)
     if missing:
         within = size_text(specification.block_bytes)
         progress_bar.set_postfix_str(f"blocks of {runner.run_count(0)}, each within {within}")
-    # The first block is always computed here, and creates the arrays of the store.
+    # The first block is always computed here: a fault of the case is found before it is sent.
     computed_locally = missing if client is None else missing[:1]
     for block in _compute(runner, computed_locally, steps, block_store):
         progress_bar.update(runner.run_count(block))
     if client is not None:
         for block in cluster.compute_blocks(client, fingerprint, path, missing[1:]):
             progress_bar.update(runner.run_count(block))
-    dataset = _to_dataset(specification, runner.batches, block_store.collect())
+    dataset = _to_dataset(specification, runner.batches, block_store.collect(runner.block_count))
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
     if estimates:
         worst = worst_runs(specification, dataset)
@@ -96,9 +96,9 @@ def _begun(
     steps, error = runner.choose_step_sizes()
     progress_bar.set_description(None)
     if path is None:
-        return runner, steps, error, MemoryStore(runner.block_count)
+        return runner, steps, error, MemoryStore()
     content, given = specification.to_dict() | {"native": native}, np.append(steps, error)
-    new = path, specification.fingerprint(), content, runner.block_count, given
+    new = path, specification.fingerprint(), content, given
     return runner, steps, error, sweep_store.create_store(*new)
 
 

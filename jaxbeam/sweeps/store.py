@@ -1,10 +1,10 @@
-"""Stores of sweeps: blocks in zarr, which one process writes and all read, and in memory.
+"""Stores of sweeps: blocks in files, which one process writes each and all read, and in memory.
 
-During a sweep each block is one chunk of flat arrays in the group `blocks`, written before its flag
-in the array `done`. The labelled dataset then replaces the group; the store is complete when the
-group is gone. A fingerprint of all that determines the results protects against mixing sweeps: the
-arrays of blocks are in a group named by it, so that a worker that was left behind by an earlier
-sweep at this path writes none of its blocks among those of another.
+During a sweep each process appends the blocks that it has computed to a file of its own in the
+group `blocks`, each with a checksum. The labelled dataset then replaces the group; the store is
+complete when the group is gone. A fingerprint of all that determines the results protects
+against mixing sweeps: the files of blocks are in a group named by it, so that a worker that was
+left behind by an earlier sweep at this path writes none of its blocks among those of another.
 
 A sweep that overwrites another writes to a folder `.NAME.new` beside it, which takes the place of
 the other when the sweep is complete. Repeated after an interrupt it continues there.
@@ -15,16 +15,22 @@ from __future__ import annotations
 import abc
 import contextlib
 import json
+import math
+import os
 import shutil
+import struct
 import tempfile
+import uuid
 import warnings
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jaxbeam.files.netcdf import check_codecs
+from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.output_file import naming_file, writer_lock
 
@@ -37,16 +43,16 @@ class BlockStore(abc.ABC):
     """Store of finished blocks, in memory or on disk."""
 
     @abc.abstractmethod
-    def missing(self) -> list[int]:
-        """Numbers of the blocks that are not stored."""
+    def missing(self, blocks: Sequence[int]) -> list[int]:
+        """Those of the numbers of blocks that are not stored."""
 
     @abc.abstractmethod
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
         """Store the results of a block by name; their shapes are the same for all blocks."""
 
     @abc.abstractmethod
-    def collect(self) -> dict[str, np.ndarray]:
-        """Results of all blocks by name, concatenated along the first axis."""
+    def collect(self, blocks: int) -> dict[str, np.ndarray]:
+        """Results of so many blocks by name, concatenated along the first axis."""
 
     @abc.abstractmethod
     def finish(self, dataset: xarray.Dataset) -> None:
@@ -56,18 +62,18 @@ class BlockStore(abc.ABC):
 class MemoryStore(BlockStore):
     """Store in memory."""
 
-    def __init__(self, blocks: int):
-        self._blocks: list[dict[str, np.ndarray]] = [{} for _ in range(blocks)]
+    def __init__(self):
+        self._blocks: dict[int, dict[str, np.ndarray]] = {}
 
-    def missing(self):
-        return [i for i, block in enumerate(self._blocks) if not block]
+    def missing(self, blocks):
+        return [block for block in blocks if block not in self._blocks]
 
     def write(self, block, results):
         self._blocks[block] = results
 
-    def collect(self):
-        names = self._blocks[0]
-        return {name: np.concatenate([block[name] for block in self._blocks]) for name in names}
+    def collect(self, blocks):
+        parts = [self._blocks[block] for block in range(blocks)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def finish(self, dataset):
         pass
@@ -75,6 +81,7 @@ class MemoryStore(BlockStore):
 
 FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
 BLOCKS_GROUP = "blocks"
+BLOCK_FILES = ".blocks"  # ending of the files of blocks
 DAMAGE_ERRORS = (
     OSError,
     ValueError,
@@ -98,11 +105,6 @@ def checksummed() -> list[Any]:
     from zarr.codecs import ZstdCodec
 
     return [ZstdCodec(level=1, checksum=True)]
-
-
-def array_options() -> dict[str, Any]:
-    """Options of arrays with which damaged and missing chunks are detected."""
-    return {"compressors": checksummed(), "config": {"write_empty_chunks": True}}
 
 
 def is_complete(array: zarr.Array) -> bool:
@@ -188,8 +190,64 @@ def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
         shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)
 
 
+MAX_FILE_BYTES = 2**30  # of blocks, after which a process begins another file
+# Before each block: its number, its length in bytes, and their checksum, begun at the number.
+BLOCK_HEAD = struct.Struct("<IQI")
+
+
+class BlockPlace(NamedTuple):
+    """Place of a block in a file: its first byte and length after the head, and its checksum."""
+
+    file: Path
+    block: int
+    start: int
+    length: int
+    checksum: int
+
+
+def append_block(file: Path, block: int, results: dict[str, np.ndarray]) -> None:
+    """Append the results of a block to a file: a head, a line of JSON, then the numbers."""
+    arrays = [np.ascontiguousarray(values) for values in results.values()]
+    kinds = [(values.dtype.str, values.shape) for values in arrays]
+    parts = [json.dumps([list(results), kinds]).encode() + b"\n", *arrays]
+    length, checksum = sum(memoryview(part).nbytes for part in parts), block
+    for part in parts:
+        checksum = zlib.crc32(part, checksum)
+    with open(file, "ab") as opened:
+        opened.writelines([BLOCK_HEAD.pack(block, length, checksum), *parts])
+
+
+def block_places(file: Path) -> Iterator[BlockPlace]:
+    """Places of the blocks of a file, without the last one if its writing was interrupted."""
+    with open(file, "rb") as opened:
+        size, start = os.fstat(opened.fileno()).st_size, BLOCK_HEAD.size
+        while start <= size:
+            opened.seek(start - BLOCK_HEAD.size)
+            block, length, checksum = BLOCK_HEAD.unpack(opened.read(BLOCK_HEAD.size))
+            if length > size - start:
+                return
+            yield BlockPlace(file, block, start, length, checksum)
+            start += length + BLOCK_HEAD.size
+
+
+def read_block(place: BlockPlace) -> dict[str, np.ndarray]:
+    """Results of a block by name. Raises ValueError if it is not as it was written."""
+    with open(place.file, "rb") as opened:
+        opened.seek(place.start)
+        content = opened.read(place.length)
+    if zlib.crc32(content, place.block) != place.checksum:
+        raise ValueError(f"a block of {place.file.name} is not as it was written")
+    start = content.index(b"\n") + 1
+    results, (names, kinds) = {}, json.loads(content[:start])
+    for name, (dtype, shape) in zip(names, kinds, strict=True):
+        values = np.frombuffer(content, dtype, math.prod(shape), start)
+        results[name] = values.reshape(shape)
+        start += values.nbytes
+    return results
+
+
 class ZarrStore(BlockStore):
-    """Store of blocks in zarr format; `steps` are those given to `create_store`.
+    """Store of blocks in a zarr group; `steps` are those given to `create_store`.
 
     Raises ValueError if it cannot be read.
     """
@@ -203,91 +261,63 @@ class ZarrStore(BlockStore):
             group: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
             mark = blocks_mark(str(group.attrs[FINGERPRINT_ATTRIBUTE]))
             self._blocks: Any = group[BLOCKS_GROUP][mark]
-            self._folder = path / BLOCKS_GROUP / mark
             self.steps = np.asarray(self._blocks["steps"][:])
-            self._flags = self._blocks["done"]
-            self._count = self._flags.shape[0]
-        self._arrays: dict[str, Any] = {}  # opened once, as opening takes as long as writing
+        self._folder = path / BLOCKS_GROUP / mark
+        self._own_file = self._new_file()
 
     def specification(self) -> dict[str, Any]:
         """Specification of the sweep, as given to `create_store`."""
         with explaining_damage(self._path):
             return json.loads(np.asarray(self._blocks["order"][:]).tobytes())
 
-    def missing(self) -> list[int]:
-        flagged = [block for block in range(self._count) if self._is_flagged(block)]
-        damaged = [] if self._all_readable() else [b for b in flagged if not self._is_intact(b)]
-        if damaged:
+    def missing(self, blocks: Sequence[int]) -> list[int]:
+        written = {place.block for place in self._places(blocks)}
+        intact = {block for block, _ in self._intact(blocks)}
+        if damaged := written - intact:
             warnings.warn(
                 f"{self._path}: {len(damaged)} finished blocks are damaged and are computed again",
                 stacklevel=3,
             )
-        return sorted(set(range(self._count)) - set(flagged) | set(damaged))
-
-    def is_done(self, block: int) -> bool:
-        """Whether a block has been written and can be read."""
-        return self._is_flagged(block) and self._is_intact(block)
+        return [block for block in blocks if block not in intact]
 
     def write(self, block: int, results: dict[str, np.ndarray]) -> None:
         with explaining_write_errors(self._path):
-            for name, values in results.items():
-                size = values.shape[0]
-                self._result_array(name, values)[block * size : (block + 1) * size] = values
-            self._flags[block] = True
+            if self._own_file.exists() and self._own_file.stat().st_size > MAX_FILE_BYTES:
+                self._own_file = self._new_file()
+            append_block(self._own_file, block, results)
 
-    def collect(self) -> dict[str, np.ndarray]:
+    def collect(self, blocks: int) -> dict[str, np.ndarray]:
+        """Results of so many blocks. Raises ValueError if one is not stored, or damaged."""
+        collected: dict[str, np.ndarray] = {}
+        found = set()
         with explaining_damage(self._path):
-            return {name: np.asarray(self._blocks[name][:]) for name in self._names()}
+            for block, results in self._intact(range(blocks)):
+                for name, values in results.items():
+                    if name not in collected:
+                        collected[name] = np.empty((blocks, *values.shape), values.dtype)
+                    collected[name][block] = values
+                found.add(block)
+            if len(found) < blocks:
+                raise ValueError("finished blocks cannot be read")
+        return {name: collapse(values, 0, 2) for name, values in collected.items()}
 
     def finish(self, dataset: xarray.Dataset) -> None:
         replace_blocks(self._path, dataset)
 
-    def _names(self) -> list[str]:
-        return sorted(set(self._blocks.array_keys()) - {"done", "steps", "order"})
+    def _new_file(self) -> Path:
+        """Path of a file of blocks that no other process writes."""
+        return self._folder / f"{uuid.uuid4().hex}{BLOCK_FILES}"
 
-    def _result_array(self, name: str, values: np.ndarray) -> Any:
-        """Array of all results of a name, created with the shapes of the first block."""
-        if name not in self._arrays:
-            if name not in self._blocks:
-                self._blocks.create_array(
-                    name,
-                    shape=(self._count * values.shape[0], *values.shape[1:]),
-                    chunks=values.shape,
-                    dtype=values.dtype,
-                    **array_options(),
-                )
-            self._arrays[name] = self._blocks[name]
-        return self._arrays[name]
+    def _places(self, blocks: Sequence[int]) -> Iterator[BlockPlace]:
+        """Places of some blocks; of one that was computed again there are several."""
+        for file in sorted(self._folder.glob(f"*{BLOCK_FILES}")):
+            yield from (place for place in block_places(file) if place.block in blocks)
 
-    def _is_flagged(self, block: int) -> bool:
-        if not (self._folder / "done" / "c" / str(block)).is_file():
-            return False
-        try:
-            return bool(self._flags[block])
-        except DAMAGE_ERRORS:
-            return False
-
-    def _all_readable(self) -> bool:
-        """Whether all blocks can be read: a fast check before `_is_intact`."""
-        try:
-            complete = all(is_complete(self._blocks[name]) for name in self._names())
-            return complete and bool(self.collect())
-        except ValueError:
-            return False
-
-    def _is_intact(self, block: int) -> bool:
-        """Whether all results of a block exist and can be read."""
-        try:
-            for name in self._names():
-                array = self._blocks[name]
-                size = array.chunks[0]
-                chunk = Path("c", str(block), *["0"] * (array.ndim - 1))
-                if not (self._folder / name / chunk).is_file():
-                    return False
-                array[block * size : (block + 1) * size]
-        except DAMAGE_ERRORS:
-            return False
-        return True
+    def _intact(self, blocks: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Numbers and results of those of some blocks that can be read."""
+        for place in self._places(blocks):
+            with contextlib.suppress(*DAMAGE_ERRORS):
+                yield place.block, read_block(place)
 
 
 def read_dataset(path: Path) -> xarray.Dataset:
@@ -343,19 +373,15 @@ def create_store(
     path: Path,
     fingerprint: str,
     specification: dict[str, Any],
-    blocks: int,
     steps: np.ndarray,
 ) -> ZarrStore:
-    """New store for a number of blocks, with the specification of the sweep.
+    """New store of a sweep, with its specification.
 
     `steps` are the step sizes (s) of the batches and the error estimate. Raises OSError if the
     store cannot be written.
     """
     with new_store(path, fingerprint) as group:
         blocks_group = group[BLOCKS_GROUP].create_group(blocks_mark(fingerprint))
-        blocks_group.create_array(
-            "done", shape=(blocks,), chunks=(1,), dtype=bool, fill_value=False
-        )
         blocks_group.create_array("steps", data=np.asarray(steps, float), compressors=checksummed())
         specification_bytes = np.frombuffer(json.dumps(specification).encode(), np.uint8)
         blocks_group.create_array("order", data=specification_bytes, compressors=checksummed())

@@ -18,7 +18,7 @@ from jaxbeam.sweeps import cluster
 from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
 from jaxbeam.sweeps.store import ZarrStore, create_store
 from tests.sweeps.test_store import files_of
-from tests.sweeps.test_sweep import CASE
+from tests.sweeps.test_sweep import CASE, blocks_written
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
@@ -48,7 +48,7 @@ def local_store(tmp_path_factory):
 
 def kill_one(client, store: Path) -> None:
     """Kill a worker as soon as three blocks are done."""
-    while len(list(store.glob("blocks/*/done/c/*"))) < 3:
+    while len(blocks_written(store)) < 3:
         time.sleep(0.001)
     os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
@@ -100,7 +100,7 @@ def test_workers_refuse_missing_stores_and_other_versions(tmp_path, monkeypatch)
     with pytest.raises(ValueError, match="where all machines see it"):
         cluster.compute_and_store([0], "fingerprint", path)
     content = sweep_specification(CASE, {"loads.0.mass": [0.1]}, False, False, 1e-7, "double")
-    create_store(path, "fingerprint", content.to_dict(), 1, np.ones(2))
+    create_store(path, "fingerprint", content.to_dict(), np.ones(2))
     monkeypatch.setattr(cluster, "_runner", lambda fingerprint, store: (None, "other"))
     with pytest.raises(ValueError, match="another version of jaxbeam"):
         cluster.compute_and_store([0], "fingerprint", path)

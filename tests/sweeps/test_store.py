@@ -1,6 +1,7 @@
 """Stores that are damaged, full or not writable: one sentence, and finished blocks are kept."""
 
 import ast
+import contextlib
 import json
 import pickle
 import resource
@@ -14,7 +15,7 @@ import xarray
 import jaxbeam as jb
 from jaxbeam.simulation.stored_record import read_record
 from jaxbeam.sweeps.specification import SweepSpecification
-from jaxbeam.sweeps.store import ZarrStore
+from jaxbeam.sweeps.store import ZarrStore, append_block, block_places, read_block
 from tests.modules import module_files, parse
 from tests.sweeps.test_sweep import CASE
 from tuning import read_logs
@@ -70,7 +71,7 @@ def unfinished(tmp_path_factory):
 
 
 def blocks_of(store: Path) -> Path:
-    """Folder of the arrays of an unfinished store."""
+    """Folder of the blocks of an unfinished store."""
     (folder,) = (path for path in (store / "blocks").iterdir() if path.is_dir())
     return folder
 
@@ -81,7 +82,7 @@ def truncate(path: Path) -> None:
 
 def flip_bits(path: Path) -> None:
     content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0x55
+    content[len(content) * 2 // 3] ^= 0x55
     path.write_bytes(content)
 
 
@@ -105,19 +106,56 @@ def test_damaged_results_are_refused(copy, part, damage):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("part", ["peak_deflection/c/1/0/0", "done/c/1"])
-def test_damaged_blocks_are_computed_again(unfinished, complete, tmp_path, part, damage):
+def test_damaged_blocks_are_computed_again(unfinished, complete, tmp_path, damage):
     path = tmp_path / "runs.zarr"
     shutil.copytree(unfinished, path)
-    DAMAGES[damage](blocks_of(path) / part)
-    if part == "done/c/1":
+    (file,) = blocks_of(path).glob("*.blocks")
+    DAMAGES[damage](file)
+    left = {"truncated": [1, 2], "flipped bits": [1, 2], "empty": [0, 1, 2], "missing": [0, 1, 2]}
+    warns = damage == "flipped bits"  # the others are as if the writing had been interrupted
+    sentence = "1 finished blocks are damaged and are computed again"
+    with pytest.warns(UserWarning, match=sentence) if warns else contextlib.nullcontext():
+        assert ZarrStore(path).missing(range(3)) == left[damage]
+    with pytest.warns(UserWarning, match=sentence) if warns else contextlib.nullcontext():
         found = sweep(path, resume=True)
-    else:
-        with pytest.warns(
-            UserWarning, match="1 finished blocks are damaged and are computed again"
-        ):
-            found = sweep(path, resume=True)
     xarray.testing.assert_identical(found, complete[1])
+
+
+def test_every_changed_byte_of_a_block_is_noticed(tmp_path):
+    file, results = tmp_path / "a.blocks", {"x": np.arange(6.0).reshape(1, 3, 2), "y": np.ones(2)}
+    for block in (7, 8):
+        append_block(file, block, results)
+    content = file.read_bytes()
+    for place in range(len(content)):
+        file.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+        found = []
+        for one in block_places(file):
+            with contextlib.suppress(ValueError):
+                found.append((one.block, read_block(one)))
+        assert len(found) < 2
+        for block, values in found:
+            assert block in (7, 8)
+            assert all(np.array_equal(values[name], results[name]) for name in results)
+    for length in range(len(content)):
+        file.write_bytes(content[:length])
+        whole = [read_block(one) for one in block_places(file)]
+        assert len(whole) == length // (len(content) // 2)
+
+
+def test_large_sweeps_have_several_files_of_blocks(tmp_path, complete, monkeypatch):
+    monkeypatch.setattr("jaxbeam.sweeps.store.MAX_FILE_BYTES", 1)
+    path = tmp_path / "runs.zarr"
+    stop_after(2, path)
+    assert [len(list(block_places(file))) for file in blocks_of(path).glob("*.blocks")] == [1, 1]
+    xarray.testing.assert_identical(sweep(path, resume=True), complete[1])
+
+
+def test_blocks_of_objects_are_refused(tmp_path):
+    file = tmp_path / "a.blocks"
+    append_block(file, 0, {"x": np.array([None, 1], dtype=object)})
+    (place,) = block_places(file)
+    with pytest.raises(ValueError, match="OBJECT"):
+        read_block(place)
 
 
 def test_damaged_unfinished_stores_are_refused(unfinished, tmp_path):
@@ -134,7 +172,7 @@ def test_damaged_unfinished_stores_are_refused(unfinished, tmp_path):
     truncate(path / "zarr.json")
     with pytest.raises(FileExistsError, match="is not a sweep of jaxbeam"):
         sweep(path, overwrite=True)
-    assert (blocks_of(path) / "done").is_dir()
+    assert list(blocks_of(path).glob("*.blocks"))
 
 
 def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
@@ -147,7 +185,7 @@ def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
             sweep(path, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert ZarrStore(path).missing() == [2]
+    assert ZarrStore(path).missing(range(3)) == [2]
     xarray.testing.assert_identical(sweep(path, resume=True), complete[1])
     assert not list(path.rglob("*.partial"))
 

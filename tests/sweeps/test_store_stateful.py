@@ -92,20 +92,21 @@ class Store(RuleBasedStateMachine):
         """Whether a sweep can be begun or resumed: no other is in its place."""
         return self.begun in (None, sweep) or self.beside == sweep
 
-    @rule(which=st.integers(0, 10**6), damage=st.sampled_from(["truncate", "delete"]))
+    @rule(which=st.integers(0, 10**6), damage=st.sampled_from(["truncate", "delete", "change"]))
     def damage_an_unfinished_block(self, which, damage):
         """Blocks of an unfinished sweep are computed again."""
-        chunks = sorted(self.path.glob("blocks/*/*/c/*"))
-        chunks = [chunk for chunk in chunks if chunk.parts[-3] not in ("steps", "order")]
-        if not chunks:
+        files = sorted(self.path.glob("blocks/*/*.blocks"))
+        if not files:
             return
-        chunk = chunks[which % len(chunks)]
-        files = [chunk] if chunk.is_file() else [p for p in chunk.rglob("*") if p.is_file()]
-        for file in files:
-            if damage == "delete":
-                file.unlink()
-            else:
-                file.write_bytes(file.read_bytes()[:-1])
+        file = files[which % len(files)]
+        content = bytearray(file.read_bytes())
+        if damage == "delete" or not content:
+            file.unlink()
+        elif damage == "truncate":
+            file.write_bytes(content[:-1])
+        else:
+            content[which % len(content)] ^= 1
+            file.write_bytes(content)
 
     @rule()
     def read(self):

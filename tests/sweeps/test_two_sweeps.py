@@ -14,7 +14,7 @@ import xarray
 import jaxbeam as jb
 from jaxbeam.runtime.output_file import InUseError
 from jaxbeam.sweeps import store as store_writing
-from jaxbeam.sweeps.store import ZarrStore, create_store, status, writing
+from jaxbeam.sweeps.store import ZarrStore, block_places, create_store, status, writing
 from tests.sweeps.test_store import CASE, OVER, files_of, stop_after, sweep
 
 OTHER = jb.replace(CASE, {"beam.flexural_rigidity": 20.0})
@@ -67,17 +67,19 @@ def test_failed_overwriting_loses_nothing_and_goes_on_when_repeated(tmp_path, ex
     stop_after(2, path, overwrite=True)
     assert files_of(path) == before
     blocks = tmp_path / ".runs.zarr.new" / "blocks"
-    kept = sorted(blocks.glob("*/done/c/*"))
-    times = [flag.stat().st_mtime_ns for flag in kept]
-    assert len(kept) == 2
+    (kept,) = blocks.glob("*/*.blocks")
+    content = kept.read_bytes()
+    assert len(list(block_places(kept))) == 2
 
-    def compare_times(self, dataset):
-        assert [flag.stat().st_mtime_ns for flag in kept] == times
+    def compare_blocks(self, dataset):
+        assert kept.read_bytes() == content
+        (added,) = set(blocks.glob("*/*.blocks")) - {kept}
+        assert len(list(block_places(added))) == 1
         finish(self, dataset)
 
     finish = ZarrStore.finish
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ZarrStore, "finish", compare_times)
+        patch.setattr(ZarrStore, "finish", compare_blocks)
         found = sweep(path, overwrite=True)
     xarray.testing.assert_identical(found, expected)
     xarray.testing.assert_identical(sweep(path, resume=True), expected)
@@ -135,17 +137,18 @@ def test_blocks_of_an_earlier_sweep_do_not_get_among_those_of_another(tmp_path):
     """A worker of a cluster may live longer than the sweep that it works for."""
     path, results = tmp_path / "runs.zarr", {"peak_deflection": np.ones((1, 2, 1))}
     with writing(path, "a" * 64, False, False) as place:
-        worker = create_store(place.folder, "a" * 64, {}, 2, np.ones(3))
+        worker = create_store(place.folder, "a" * 64, {}, np.ones(3))
     with writing(path, "b" * 64, False, True) as place:
         assert place.folder != path
-        create_store(place.folder, "b" * 64, {}, 2, np.ones(3))
+        create_store(place.folder, "b" * 64, {}, np.ones(3))
     store = ZarrStore(path)
     store.write(0, results)
-    worker.write(1, {"peak_deflection": 9 * results["peak_deflection"]})
-    worker.write(0, {"peak_deflection": 9 * results["peak_deflection"]})
+    for block in (0, 1):
+        with pytest.raises(OSError, match="cannot write"):
+            worker.write(block, {"peak_deflection": 9 * results["peak_deflection"]})
     store = ZarrStore(path)
-    assert store.missing() == [1]
-    np.testing.assert_array_equal(store.collect()["peak_deflection"][0], 1.0)
+    assert store.missing([0, 1]) == [1]
+    np.testing.assert_array_equal(store.collect(1)["peak_deflection"][0], 1.0)
     with pytest.raises(OSError, match="another sweep has taken its place"):
         worker.finish(xarray.Dataset(attrs={"jaxbeam_sweep": "a" * 64}))
 

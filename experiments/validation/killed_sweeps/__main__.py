@@ -10,6 +10,7 @@ lost; the store in the end has the bytes of a sweep on one machine without any o
 """
 
 import argparse
+import contextlib
 import os
 import random
 import subprocess
@@ -27,6 +28,7 @@ import jaxbeam as jb
 from experiments.benchmarks.common import print_row, print_table
 from experiments.validation.killed_sweeps.cluster import ROOT, Cluster, kill
 from jaxbeam.files.case_file import case_to_dict
+from jaxbeam.sweeps.store import block_places
 
 KILLS = 6  # of a sweep
 LONGEST = 240.0  # s without a finished block, within which a client ends
@@ -52,9 +54,12 @@ def files_of(store: Path) -> dict[str, bytes]:
     return {str(path.relative_to(store)): path.read_bytes() for path in files}
 
 
-def finished(store: Path) -> set[str]:
-    """Names of the finished blocks of a store."""
-    return {flag.name for flag in store.glob("blocks/*/done/c/*")}
+def finished(store: Path) -> set[int]:
+    """Numbers of the finished blocks of a store."""
+    files = store.glob("blocks/*/*.blocks")
+    with contextlib.suppress(FileNotFoundError):  # the sweep has ended in between
+        return {place.block for file in files for place in block_places(file)}
+    return set()
 
 
 class CommandSweep:

@@ -18,19 +18,19 @@ AHEAD = float(os.environ.get("KILLED_SWEEPS_CLOCK", "0"))
 
 def change_writes() -> None:
     """Have blocks written slowly; the writing of some raises OSError, as without space."""
-    from jaxbeam.sweeps.store import ZarrStore
+    from jaxbeam.sweeps import store
 
     slow, full = (float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL"))
-    draws, result_array = random.Random(os.getpid()), ZarrStore._result_array
+    draws, append_block = random.Random(os.getpid()), store.append_block
 
-    def array(self, name, values):
-        """The array of a result, just before a block is written to it; raises OSError at times."""
+    def append(file, block, results):
+        """Append a block to a file, slowly; raises OSError at times."""
         time.sleep(draws.expovariate(1 / slow) if slow else 0.0)
         if draws.random() < full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return result_array(self, name, values)
+        append_block(file, block, results)
 
-    ZarrStore._result_array = array
+    store.append_block = append
 
 
 if __name__ == "__main__":
