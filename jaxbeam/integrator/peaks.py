@@ -21,7 +21,7 @@ from jaxbeam.numerics.peak_search import (
     locate_peak,
     max_with_ties,
     refine_peak,
-    steps_beside_peak,
+    steps_near_peak,
 )
 from jaxbeam.runtime.arrays import (
     Array,
@@ -180,7 +180,7 @@ def update_peaks(
 def peaks_of_steps(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
     """Running peaks of a traced run with all steps in one chunk, computed without branches."""
     fixed, magnitude = stop_gradient(samples), initial.magnitude
-    steps = steps_beside_peak(fixed, stop_gradient(length), PEAK_NODES, magnitude)
+    steps = steps_near_peak(fixed, stop_gradient(length), PEAK_NODES, magnitude)
     candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)
     positions, heights = locate_peak(stop_gradient(candidates), PEAK_NODES, magnitude)
     highest = xp.argmax(heights, axis=0) == np.arange(len(steps))[:, None, None]

@@ -21,7 +21,7 @@ MAX_UNROLLED_TERMS = 12  # of a sum that takes as long as the call of a library 
 def solve_small(
     matrix: Float[Array, "row row batch"], right: Float[Array, "row column batch"]
 ) -> Float[Array, "row column batch"]:
-    """Solve systems by block elimination in halves: few operations, each on the whole batch.
+    """Solutions of systems by block elimination in halves: few operations on the whole batch.
 
     For matrices that need no pivoting: positive definite ones, or the identity plus masses times a
     positive definite one. Linear in the right side, so that it can be transposed.
@@ -32,13 +32,13 @@ def solve_small(
 
 
 def _solve(matrix, right):
-    """Solve known systems, batch axis last."""
+    """Solutions of systems of concrete numbers by NumPy, batch axis last."""
     batch_first = (np.moveaxis(part, -1, 0) for part in (matrix, right))
     return np.moveaxis(np.linalg.solve(*batch_first), 0, -1)
 
 
 def _block_eliminate(matrix, *rights):
-    """Solutions for several right sides."""
+    """Solutions for several right sides by block elimination, batch axis last."""
     size = matrix.shape[0]
     if size <= 3:
         inverse = _cofactor_inverse(matrix)
@@ -97,7 +97,7 @@ def matvec(
 def solve_unpivoted(
     matrix: Float[Array, "row row"], right: Float[Array, "row column"]
 ) -> Float[Array, "row column"]:
-    """Solve a system of any size without pivoting; under `vmap` the batch axis is the last.
+    """Solution of a system of any size without pivoting; under `vmap` the batch axis is last.
 
     By a loop, which compiles quickly for larger matrices too, unlike `solve_small`. LAPACK's
     factorisations of batches may deadlock where several run at the same time: jaxlib hands parts of
@@ -124,7 +124,7 @@ def solve_each(
 
 @jax.custom_batching.custom_vmap
 def _gauss_jordan(matrix, right):
-    """Solve systems (row, column, *batch) by Gauss-Jordan elimination."""
+    """Solutions of systems (row, column, *batch) by Gauss-Jordan elimination."""
     size = matrix.shape[0]
     rows = np.arange(size).reshape(-1, *[1] * (matrix.ndim - 1))
 
@@ -150,7 +150,7 @@ def _(count, batched, *systems):
 def matmul_last(
     a: Float[Array, "row term batch"], b: Float[Array, "term column batch"]
 ) -> Float[Array, "row column batch"]:
-    """Products of matrices, batch axis last, spelt out where the sums are short and traced."""
+    """Products of matrices, batch axis last, unrolled where the sums are short and traced."""
     if 0 < a.shape[1] <= MAX_UNROLLED_TERMS and any_jax(a, b):
         return _unrolled_matmul(a, b)
     return xp.einsum("ijb,jkb->ikb", a, b)

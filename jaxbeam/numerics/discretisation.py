@@ -80,17 +80,17 @@ def exponential_and_gramian(
 
 
 def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
-    """Scale of the states with which rows and columns of the matrix have like norms.
+    """Scale of the states with which rows and columns of the matrix have similar norms.
 
     Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
-    The balanced matrix is A * scale / scale[:, None]. Without a derivative: what follows must not
-    depend on the scale but by rounding, else take `differentiable_balance`.
+    The balanced matrix is A * scale / scale[:, None]. The scale has no derivative: use it where
+    results depend on it by rounding only, else `differentiable_balance`.
     """
     return stop_gradient(differentiable_balance(matrix))
 
 
 def differentiable_balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
-    """As `balance`, with its derivative."""
+    """Scale of the states as `balance` returns it, with its derivative."""
     size = xp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
 
     def equalise(_, scale):
@@ -105,11 +105,11 @@ def differentiable_balance(matrix: Float[Array, "state state"]) -> Float[Array, 
 
 
 def propagate(matrix, t, duration, substeps: int, start):
-    """x(t + duration) of x' = matrix(time) x, x(t) = start, a vector or matrix.
+    """State x(t + duration) of x' = matrix(time) x from x(t) = start, a vector or matrix.
 
     Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan, Applied
-    Numerical Mathematics 56, 2006), exact for a constant matrix. Of several known times t at once,
-    where `matrix` and `start` have them as their first axis.
+    Numerical Mathematics 56, 2006), exact for a constant matrix. For several concrete times t at
+    once, `matrix` and `start` have them as their first axis.
     """
     step = duration / substeps
     first_node, second_node = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
@@ -132,7 +132,7 @@ def propagate(matrix, t, duration, substeps: int, start):
 
 
 def exponential_times(matrix, state):
-    """exp(M) X; of a stack of known matrices by its series, without the exponentials."""
+    """Product exp(M) X; for a stack of concrete matrices by the series of the product."""
     if is_jax(matrix) or matrix.ndim == 2:
         return expm(matrix) @ state
     scale = balance(np.max(np.abs(matrix), axis=0))
@@ -161,7 +161,7 @@ def hermite_cubics(
 ) -> Float[Array, "interval power"]:
     """Coefficients c_k of the cubics in s / h through samples and their rates (per s).
 
-    Straight lines without rates.
+    Without rates they are straight lines.
     """
     difference = xp.diff(values)
     start, end = (difference, difference)

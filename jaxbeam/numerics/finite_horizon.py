@@ -49,7 +49,7 @@ CouplingFunction = Callable[[Float[Array, "..."]], Coupling]
 
 
 def interval_halvings(min_intervals: int) -> Int[np.ndarray, " group"]:
-    """How often the intervals of each group are halved, for at least so many intervals."""
+    """Number of halvings of each group of intervals, for at least `min_intervals` intervals."""
     group_count = max(1, -(-min_intervals // INTERVALS_PER_GROUP))
     tenth = group_count // 10
     before = np.repeat([0, 1, 2], [group_count - 1 - 2 * tenth, 2 * tenth, 4 * tenth])

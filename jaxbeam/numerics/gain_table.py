@@ -35,7 +35,7 @@ class GainTable(Module):
     def __call__(self, fraction: Float[Array, ""]) -> Float[Array, "input state"]:
         """Gain at a fraction of the time span; held before 0 and after 1.
 
-        At a breakpoint, where gains may jump, that after it, even if rounding is before it.
+        At a breakpoint, where gains may jump, it is the gain after it, whatever the rounding.
         """
         i = xp.searchsorted(self.breakpoints, fraction + ROUNDING, side="right") - 1
         i = xp.clip(i, 0, self.coefficients.shape[0] - 1)
@@ -120,7 +120,7 @@ def _power_derivatives(
 
 
 def hermite_matrices(orders: int) -> tuple[Float[np.ndarray, "power order"], ...]:
-    """Matrices from derivatives at 0, and from those at 1, to the Hermite polynomial."""
+    """Matrices that map derivatives at 0, and those at 1, to the Hermite polynomial."""
     rows = [_power_derivatives(at, orders, 2 * orders) for at in (0.0, 1.0)]
     inverse = np.linalg.inv(np.concatenate(rows))
     return inverse[:, :orders], inverse[:, orders:]
@@ -160,7 +160,7 @@ def interpolate_gains(
 
 
 def _gain_and_derivatives(plant, force_input, force_law, cost, length, Q, R_inverse):
-    """Gain and its first two derivatives by the fraction of the interval.
+    """Gain and its first two derivatives with respect to the fraction of the interval.
 
     The plant is A + W V and B + W D with the force input W = E F and the law rows V of the state, D
     of the command. P is never differentiated as a whole, only its products with a few columns.

@@ -81,7 +81,7 @@ def expm(matrix: Square) -> Square:
 
 
 REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer eigenvalues are treated as repeated
-MASSLESS = 1e-20  # share of the mass in a vector: of less, there is only rounding
+MASSLESS = 1e-20  # fraction of the mass in a vector, below which that is rounding
 RIGID_BODY_EIGENVALUE = 1e-10  # in beam units: eigenvalues below are zero, of rigid-body modes
 
 
@@ -96,11 +96,11 @@ def eigen(stiffness, mass):
     if any_jax(stiffness, mass):
         return _solution(stiffness, mass)
     stiffness, mass = (np.ascontiguousarray(matrix) for matrix in (stiffness, mass))
-    return _known_solution(_Known(stiffness), _Known(mass))
+    return _cached_solution(_MatrixKey(stiffness), _MatrixKey(mass))
 
 
-class _Known:
-    """A matrix of known numbers that has a hash, and is not kept longer than by others."""
+class _MatrixKey:
+    """Key of a cache for a concrete matrix, to which it holds a weak reference."""
 
     def __init__(self, matrix: np.ndarray):
         self.reference = weakref.ref(matrix)
@@ -110,12 +110,12 @@ class _Known:
         return hash(self.content)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self.content == other.content
+        return isinstance(other, _MatrixKey) and self.content == other.content
 
 
 @functools.lru_cache(maxsize=2)  # a run asks some five times for the modes of one beam
-def _known_solution(stiffness: _Known, mass: _Known) -> tuple[Any, ...]:
-    """`eigen` of known numbers; read-only arrays."""
+def _cached_solution(stiffness: _MatrixKey, mass: _MatrixKey) -> tuple[Any, ...]:
+    """`eigen` of concrete matrices, cached; read-only arrays."""
     parts = _solution(stiffness.reference(), mass.reference())
     for part in parts:
         part.setflags(write=False)

@@ -15,20 +15,20 @@ KEY_PARITY = np.uint32(0x1BD11BDA)
 
 
 def normal_samples(seed: int, stream: int, count: int) -> Float[np.ndarray, " sample"]:
-    """Standard normal samples of a stream, a number that tells apart those with the same seed.
+    """Standard normal samples of a numbered stream; streams of one seed are independent.
 
-    Up to rounding those of `jax.random.normal(jax.random.fold_in(jax.random.key(seed), stream))`.
+    They equal `jax.random.normal(jax.random.fold_in(jax.random.key(seed), stream))` to rounding.
     """
     from scipy.special import erfinv  # 0.1 s, and most cases have no noise
 
-    share, lowest = uniform_samples(seed, (stream,), count), np.nextafter(-1.0, 0.0)
-    return np.sqrt(2) * erfinv(np.maximum(lowest, share * (1 - lowest) + lowest))
+    uniform, lowest = uniform_samples(seed, (stream,), count), np.nextafter(-1.0, 0.0)
+    return np.sqrt(2) * erfinv(np.maximum(lowest, uniform * (1 - lowest) + lowest))
 
 
 def uniform_samples(seed: int, streams: Iterable[int], count: int) -> Float[np.ndarray, " sample"]:
-    """Samples from 0 to below 1 of a stream within streams, which numbers tell apart.
+    """Uniform samples from 0 to below 1 of a stream, named by the numbers of nested `streams`.
 
-    Those of `jax.random.uniform`, whose key is folded with each of the numbers.
+    They equal those of `jax.random.uniform`, whose key is folded with each of the numbers.
     """
     key = _words(np.array([seed]))
     for stream in streams:
@@ -48,7 +48,7 @@ def _words(numbers: np.ndarray) -> UInt32[np.ndarray, "2 number"]:
 def _hash(
     key: UInt32[np.ndarray, "2 1"], counter: UInt32[np.ndarray, "2 number"]
 ) -> UInt32[np.ndarray, "2 number"]:
-    """Threefry 2x32 with 20 rounds."""
+    """Hash of counters under a key by Threefry 2x32 with 20 rounds."""
     keys = np.stack([*key, key[0] ^ key[1] ^ KEY_PARITY])
     first, second = counter + key
     for i in range(ROUNDS_OF_FOUR):

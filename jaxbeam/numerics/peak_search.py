@@ -60,8 +60,8 @@ def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]
 def polynomial(coefficients, position):
     """Value of a polynomial; coefficients with the lowest power first.
 
-    Those of a list by Horner's rule, spelt out for programs that evaluate it often; those of an
-    array by its powers, of which programs compile sooner.
+    A list of coefficients is evaluated by Horner's rule, unrolled, for programs that do so often;
+    an array by powers of the position, which compile faster.
     """
     if not isinstance(coefficients, list):
         count, *rest = coefficients.shape
@@ -109,7 +109,7 @@ def estimate_peak(
 ) -> Float[Array, " *rest"]:
     """Estimate of the peak, searched from the largest sample only.
 
-    It tells which of many steps has the peak, which `refine_peak` then finds.
+    It selects the step with the peak among many; `refine_peak` then computes the peak there.
     """
     magnitudes = magnitude(samples)
     largest = xp.max(magnitudes, axis=0)
@@ -121,16 +121,16 @@ def estimate_peak(
     return xp.maximum(magnitude(polynomial(curve.value, position)), largest)
 
 
-def steps_beside_peak(
+def steps_near_peak(
     samples: Float[Array, "step point *rest"],
     lengths: Float[Array, " step"],
     points: tuple[float, ...],
     magnitude: Callable,
 ) -> Int[Array, "candidate *rest"]:
-    """Three steps, one of which has the peak of the polynomials through the samples of each.
+    """Indices of three steps, one of which has the peak of the polynomials through the samples.
 
-    That with the largest of values at equal distances, and those beside it: the next ones that are
-    not of (nearly) no `lengths`, as are those between events at one time.
+    They are the step with the largest of equidistant values, and the nearest steps before and after
+    it whose `lengths` are not (nearly) zero, as are those between events at one time.
     """
     grid = np.linspace(-1.0, 1.0, START_POINTS)[:, None] ** np.arange(len(points))
     weights = grid @ interpolation_matrix(points)[: len(points)]
@@ -148,7 +148,7 @@ def steps_beside_peak(
 def locate_peak(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
 ) -> tuple[Float[Array, " *rest"], Float[Array, " *rest"]]:
-    """Position in [-1, 1] of the largest magnitude of the polynomial through samples, and it."""
+    """Position in [-1, 1] and value of the largest magnitude of the polynomial of samples."""
     curve = _interpolate(samples, points)
     if not is_jax(samples):  # NumPy takes long for powers
         curve = Curve(*map(list, curve))

@@ -20,7 +20,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 
 def powers(x: Float[Array, " *place"], count: int) -> Float[Array, "power *place"]:
-    """Powers 0 to count - 1; differentiable at 0 too, where those of JAX are not."""
+    """Powers 0 to count - 1 of x; differentiable at 0 too, where those of JAX are not."""
     return _powers(x, np.arange(count, dtype=float).reshape(-1, *(1,) * xp.ndim(x)))
 
 
@@ -107,7 +107,7 @@ def slope_jumps(nodes, series) -> Float[Array, "inner column"]:
 def _evaluate_series(series, local, segment):
     """Values of the series at local positions, -1 to 1, in their segments."""
     if not any_jax(series, local, segment):
-        return _known_values(series, local, segment)
+        return _concrete_values(series, local, segment)
     return _sum_series(_segment_polynomials(series, local, segment), series)
 
 
@@ -124,8 +124,8 @@ def _evaluate_series_jvp(primals, tangents):
     return values, _sum_series(table, series_tangent) + slopes * local_tangent[..., None]
 
 
-def _known_values(series, local, segment) -> np.ndarray:
-    """`_evaluate_series` of known numbers: of the positions in a segment by its series alone."""
+def _concrete_values(series, local, segment) -> np.ndarray:
+    """`_evaluate_series` of concrete numbers, each segment at its own positions only."""
     values = np.empty((*local.shape, series.shape[2]))
     for s in np.unique(segment):
         here = segment == s

@@ -48,7 +48,7 @@ MAX_STEPS = 100  # of the interior-point method
 STEPS_BEFORE_CENTRING = 20  # after these every other step is a pure centring step
 MAX_SWEEPS = 20000  # of Hildreth's procedure
 DUAL_REGULARISATION = 2e-12  # of the multipliers in a step, for linearly dependent rows
-SINGLE_PRECISION = {  # what takes the place of these in programs of single precision
+SINGLE_PRECISION = {  # values of these constants in programs of single precision
     TOLERANCE: 2e-5,
     HILDRETH_TOLERANCE: 1e-6,
     LIMIT_ROUNDING: 1e-6,
@@ -95,7 +95,7 @@ def solve_qp(
     """
     if method not in METHODS:
         raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
-    solve = _solve if any_jax(H, f, M, gamma) else _solve_known
+    solve = _solve if any_jax(H, f, M, gamma) else _solve_concrete
     x, multipliers, status, steps = solve(method, H, f, M, gamma)
     return Solution(x, multipliers, status, steps)
 
@@ -131,7 +131,7 @@ def _least_distance(H, f, M, gamma) -> _LeastDistance:
     )
 
 
-def _solve_known(method, H, f, M, gamma):
+def _solve_concrete(method, H, f, M, gamma):
     problem = _least_distance(H, f, M, gamma)
     solver = {"interior": _interior_point, "hildreth": _hildreth}[method]
     z, multipliers, status, steps = solver(problem.G, problem.h, problem.limits_matter)
@@ -139,7 +139,7 @@ def _solve_known(method, H, f, M, gamma):
     return x, problem.scale * multipliers / problem.row_norms, status, steps
 
 
-_solve = jax.custom_jvp(_solve_known, nondiff_argnums=(0,))
+_solve = jax.custom_jvp(_solve_concrete, nondiff_argnums=(0,))
 
 
 @_solve.defjvp
@@ -259,10 +259,10 @@ def _interior_point(G, h, limits_matter):
     return z, lib.where(limits_matter, multipliers, 0.0), status, steps
 
 
-def _step_length(lib, multipliers, multiplier_change, slack, slack_change, boundary_share):
-    """Step length, at most 1, at which no multiplier or slack decreases by more than this share."""
+def _step_length(lib, multipliers, multiplier_change, slack, slack_change, boundary_fraction):
+    """Largest step, at most 1, in which no multiplier or slack loses more than a fraction of it."""
     worst = lib.maximum((-multiplier_change / multipliers).max(), (-slack_change / slack).max())
-    return lib.where(worst > boundary_share, boundary_share / worst, 1.0)
+    return lib.where(worst > boundary_fraction, boundary_fraction / worst, 1.0)
 
 
 def _hildreth(G, h, limits_matter):

@@ -23,7 +23,7 @@ TRANSITION_TOLERANCE = 1e-9  # norm of a transition matrix whose square is below
 
 
 def lyapunov(A: Square, S: Square) -> Square:
-    """X of A'X + X A + S = 0 for a stable A; nan for another."""
+    """Solution X of A'X + X A + S = 0 for a stable A; nan for another."""
 
     def sum_of_series(matrix, right):
         shift, identity = cayley_shift(matrix), xp.eye(matrix.shape[0])
@@ -35,17 +35,17 @@ def lyapunov(A: Square, S: Square) -> Square:
 
 
 def stein(A: Square, S: Square) -> Square:
-    """X of A'X A - X + S = 0 for an A with eigenvalues in the unit circle; nan for another."""
+    """Solution X of A'X A - X + S = 0 for eigenvalues of A in the unit circle, else nan."""
     return _solve_balanced(A, S, lambda A, X: X - A.T @ X @ A, _stein_series)
 
 
 def cayley_shift(matrix: Square) -> Float[Array, ""]:
-    """A rate above that of any eigenvalue, as the centre of Cayley's transform."""
+    """Centre of Cayley's transform: a rate above that of any eigenvalue."""
     return 1.1 * xp.max(xp.sum(xp.abs(matrix), axis=1)) + xp.finfo(float).tiny
 
 
 def _solve_balanced(A: Square, S: Square, operator: Callable, solution: Callable) -> Square:
-    """X of operator(A, X) = S, linear in X, by `solution` for the balanced A."""
+    """Solution X of operator(A, X) = S, linear in X, by `solution` for the balanced A."""
     scale = balance(A)
     scaled = A * scale / scale[:, None]
     outer = scale * scale[:, None]
@@ -162,7 +162,7 @@ def indefinite_dare(A: Square, G: Square, H: Square) -> Square:
 
 @custom_jvp
 def _care(A, G, H):
-    """P of A'P + P A - P G P + H = 0."""
+    """Stabilising solution P of A'P + P A - P G P + H = 0."""
     A, G, H, unscale = _balanced(A, G, H)
     # Cayley's transform gives an equation in discrete time with the same solution.
     size = A.shape[0]
@@ -193,7 +193,7 @@ def _care_jvp(primals, tangents):
 
 @custom_jvp
 def _dare(A, G, H):
-    """P of P = A'P (1 + G P)^-1 A + H."""
+    """Stabilising solution P of P = A'P (1 + G P)^-1 A + H."""
     A, G, H, unscale = _balanced(A, G, H)
     cost = _infinite_horizon_cost(Interval(A, G, H))
     for _ in range(2):
@@ -254,7 +254,7 @@ def _infinite_horizon_cost(interval: Interval) -> Square:
 
 
 def _without_cross_weight(A, B, Q, R, N):
-    """State matrix, G = B R^-1 B' and state weight of the equal problem without cross weight."""
+    """State matrix, G = B R^-1 B' and state weight of the equivalent problem without N."""
     inverse = solve(R, xp.eye(R.shape[0]))
     G = symmetric_part(B @ inverse @ B.T)
     if N is None:

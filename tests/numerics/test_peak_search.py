@@ -125,7 +125,7 @@ def test_steps_of_no_length_hide_no_peak(short, peak):
     start = jnp.cumsum(lengths) - lengths
     times = start[:, None] + lengths[:, None] * np.array(PEAK_NODES)
     curves = 4.0 - (times - peak) ** 2
-    steps = jaxbeam.numerics.peak_search.steps_beside_peak(
+    steps = jaxbeam.numerics.peak_search.steps_near_peak(
         curves[..., None], lengths, PEAK_NODES, jnp.abs
     )
     positions, heights = jaxbeam.numerics.peak_search.locate_peak(curves[steps[:, 0]].T, PEAK_NODES)
