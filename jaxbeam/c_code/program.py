@@ -120,7 +120,7 @@ def export_c(case: Case, name: str) -> CProgram:
 
 
 def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = False) -> list[Path]:
-    """Write the files of a program to a folder; their paths.
+    """Paths of the files of a program, written to a folder.
 
     Raises FileExistsError, before anything is written, if one exists and `overwrite` is not set.
     """
@@ -141,7 +141,7 @@ def _designed(case: Case, layout):
 
 
 def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
-    """Step of a program in C, and what its texts say of it."""
+    """Step of a program in C, translated, with the facts for its comments."""
     program = sampled_program(case, law, samples)
     start = jax.tree.map(np.asarray, program.start())
     sensors, actuators = len(program.ranges), len(start.wanted)
@@ -197,7 +197,7 @@ def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
 
 
 def _parts(law: Any) -> Iterator[Module]:
-    """A law with all parts of it: filters, sources of the load, laws within."""
+    """All modules in a law, itself first: filters, sources of the load, laws within it."""
     if isinstance(law, Module):
         yield law
         law = [getattr(law, field.name) for field in dataclasses.fields(law)]
@@ -213,7 +213,7 @@ def _gate_events(gate_times: np.ndarray, end: float) -> list[tuple[float, int]]:
 
 
 def _title(case: Case, controller: AbstractController) -> list[str]:
-    """Lines that say what the program is."""
+    """Lines of a title: the controller and its case."""
     lines = [f'Controller of kind "{kind_of(type(controller))}"']
     estimator = controller.estimator if isinstance(controller, AbstractStateController) else None
     if estimator is not None:

@@ -1,4 +1,4 @@
-"""Closed loop of a designed law, recorded: inputs of a program in C, and expected commands."""
+"""Recorded closed loop of a designed law: inputs of a program in C, and expected commands."""
 
 import dataclasses
 import math
@@ -62,9 +62,9 @@ class FilteredState(NamedTuple):
 
 
 class FilteredLaw(AbstractSampledLaw):
-    """A law behind the digital filters of its sensors, which start from rest.
+    """Law whose readings pass the digital filters of its sensors, which start from rest.
 
-    For a missing sample a filter waits, and its last output stays.
+    At a missing sample a filter keeps its state and its last output.
     """
 
     law: AbstractSampledLaw
@@ -96,14 +96,14 @@ class FilteredLaw(AbstractSampledLaw):
         if readings:
             measurement = measurement._replace(readings=xp.stack(readings))
         step = self.law.step(law_state, measurement, t)
-        if not any_jax(measurement):  # also of laws that use JAX for known numbers
+        if not any_jax(measurement):  # also of laws that use JAX for concrete numbers
             step = to_numpy(step)
         state = FilteredState(step.state, after, measurement.readings)
         return ControlStep(step.command, state, step.solved)
 
 
 class _Recorder(SampledLoop):
-    """A sampled loop whose observations are readings, NaN where missing, and commands sent last."""
+    """Sampled loop whose observations are readings, NaN if missing, and the last commands sent."""
 
     def observe(self, memory, info):
         readings = self._available_readings(memory.readings, info.event)
@@ -166,7 +166,7 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
 
 
 def _plan(case: Case, times: Float[np.ndarray, " sample"]) -> IntegrationPlan:
-    """Plan with the longest stable steps, without a trial run: any motion of the beam will do."""
+    """Plan with the longest stable steps, without a trial run: accuracy does not matter here."""
     shapes, schedule = static_shapes(case), loop_schedule(case, times)
     longest = _longest_step(case, shapes.layout)
     substeps = steps_per_interval(float(schedule.lengths.max()), float(longest))

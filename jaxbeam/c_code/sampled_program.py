@@ -1,6 +1,6 @@
-"""What a program in C computes at a sample, as a function: from measurements to limited commands.
+"""Step of a program in C as a function in Python: from measurements to limited commands.
 
-It is traced and translated; NumPy runs it as well.
+It is traced and translated to C; NumPy runs it as well.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from jaxbeam.simulation.closed_loop import command_lag
 from jaxbeam.simulation.commands import CommandMemory, CommandPath, command_path
 
 GATE_TIMES = "gate_times"
-SETTINGS = {  # numbers of a law that a program may be told while it runs
+SETTINGS = {  # numbers of a law that may be changed while a program runs
     GivenLoad: ("mass", "speed", "entry_time"),
     GainSchedule: ("start", "end"),
     **dict.fromkeys((GateIdentifier, FeedforwardLaw, ConfirmedFeedforwardLaw), (GATE_TIMES,)),
@@ -33,10 +33,10 @@ NEVER = 1e30  # s, of a gate that has not been passed
 
 
 class ProgramState(NamedTuple):
-    """Numbers that a program keeps from sample to sample.
+    """State of a program from sample to sample.
 
-    Those of the law with its filters and last readings; the command that it wanted last; commands
-    on their way, of one run; and numbers that may be set, by their names.
+    It has the state of the law with its filters and last readings; the last command of the law
+    before limits; delayed commands, of one run; and numbers that may be set, by their names.
     """
 
     law: Any
@@ -46,7 +46,7 @@ class ProgramState(NamedTuple):
 
 
 class SampledProgram(Module):
-    """Law of a case with the filters of its sensors and the way of its commands.
+    """Law of a case with the filters of its sensors, and limits and delay of its commands.
 
     `ranges` (sensor, 2) are those of the readings; `begun` is the age at which commands act.
     """
@@ -58,7 +58,7 @@ class SampledProgram(Module):
     settings: dict[str, Array]
 
     def start(self) -> ProgramState:
-        """Start of a run, at rest."""
+        """Initial state of a run, at rest."""
         return ProgramState(
             self.law.initial_state(),
             np.zeros(len(self.path.case.actuators)),
@@ -73,7 +73,7 @@ class SampledProgram(Module):
         plant_state: Float[Array, " state"],
         t: Float[Array, ""],
     ) -> tuple[Float[Array, " actuator"], ProgramState]:
-        """Commands to be sent at a time (s), and the state after.
+        """Commands to be sent at a time (s), and the next state.
 
         A measurement that is no number, or outside of its range, is missing. A law with a number
         that is not finite starts again, and its last command stays.
@@ -124,7 +124,7 @@ def sampled_program(case: Case, law: AbstractSampledLaw, samples: int) -> Sample
 
 
 def settings_of(law: AbstractSampledLaw) -> dict[str, np.ndarray]:
-    """Numbers of a law that may be set, by their names, as a program has them at the start.
+    """Initial values of the numbers of a law that may be set, by their names.
 
     Gates have not been passed then.
     """
@@ -138,7 +138,7 @@ def settings_of(law: AbstractSampledLaw) -> dict[str, np.ndarray]:
 
 
 def with_settings(law, settings: dict[str, Array]):
-    """A law with other numbers of those that may be set."""
+    """Law with other values of numbers that may be set."""
 
     def changed(part):
         names = _names(part)

@@ -1,4 +1,4 @@
-"""Texts of C: numbers, tables and loops."""
+"""Texts of the C files of a program: header, source, recorded samples and check."""
 
 import re
 import textwrap
@@ -24,11 +24,11 @@ class Member(NamedTuple):
 
 
 class ProgramText(NamedTuple):
-    """Step of a program in C with its functions, state and constants, and what is said of it.
+    """Step of a program in C with its functions, state and constants, and facts for comments.
 
     `given_states` is the number of states of the plant that follow the readings among the
-    measurements; `received` are members of the state that have the last commands. Commands by
-    derivatives that are differences agree to rounding over the `difference_step`.
+    measurements; `received` are members of the state that have the last commands. Where a law
+    takes derivatives by finite differences, commands agree to rounding over `difference_step`.
     """
 
     body: str
@@ -63,7 +63,7 @@ class ProgramText(NamedTuple):
 
     @staticmethod
     def _sizes(arrays) -> tuple[int, int]:
-        """Numbers of real and of whole entries."""
+        """Counts of real entries and of whole-number entries."""
         sizes = [(array.size, array.dtype.kind == "f") for array in arrays]
         return sum(n for n, real in sizes if real), sum(n for n, real in sizes if not real)
 
@@ -78,7 +78,7 @@ ROUNDING, TOLERANCE, FLOAT_TOLERANCE = 1e-12, 1e-10, 1e-2
 
 
 def header_text(name: str, title: list[str], code: ProgramText) -> str:
-    """Header: sizes, state, functions, cost."""
+    """Text of the header: sizes, state, functions, cost."""
     big = name.upper()
     members = [
         f"    {f'{name}_real' if part.kind == 'd' else 'int'} {member}[{part.start.size}];"
@@ -126,7 +126,7 @@ void {name}_step({name}_state *s, const {name}_real *measurements, {name}_real t
 
 
 def source_text(name: str, title: list[str], code: ProgramText) -> str:
-    """Source: constants, helpers, reset, gate and step."""
+    """Text of the source: constants, helper functions, reset, gate and step."""
     constants = [
         _wrapped(f"static const {_type(values)} {constant}[] = {{{array_text(values)}}};")
         for constant, values in code.constants.items()
@@ -165,7 +165,7 @@ void {name}_step({name}_state *s, const real *measurements, real t, real *comman
 def samples_text(
     name: str, loop: RecordedLoop, given: np.ndarray, gate_events: list[tuple[float, int]]
 ) -> str:
-    """Recorded samples: times, measurements, expected commands, passages of gates."""
+    """Text of the recorded samples: times, measurements, expected commands, gate passages."""
     measurements = np.concatenate([loop.readings, given], axis=1)
     events = [number for event in gate_events for number in event]
     arrays = {
@@ -185,10 +185,10 @@ enum {{ SAMPLES = {len(loop.times)}, GATE_EVENTS = {len(gate_events)} }};
 
 
 def check_text(name: str, code: ProgramText) -> str:
-    """Loop over the recorded samples, which compares the commands with those expected.
+    """Text of the check: a loop over the recorded samples that compares commands with expected.
 
-    Those that the state has last become the recorded ones: a law may be unstable by itself, where
-    only the loop is stable, and would multiply the rounding of its own commands.
+    The last commands in the state are then replaced by the recorded ones: a law may be unstable by
+    itself, where only the loop is stable, and would amplify the rounding of its own commands.
     """
     big = name.upper()
     receive = "".join(
@@ -261,7 +261,7 @@ def _cost_lines(code: ProgramText) -> list[str]:
 
 
 def _measurements(code: ProgramText) -> str:
-    """What the measurements are, as a sentence."""
+    """Sentence on the meaning of the measurements."""
     text = f"Measurements are the readings of the sensors ({code.sensors}), in SI units"
     if code.given_states:
         text += (
@@ -280,7 +280,7 @@ void {name}_gate({name}_state *s, int gate, {name}_real t);
 
 
 def _gate_function(name: str, code: ProgramText) -> str:
-    """Function that notes the passage of a gate; the oldest load makes room for a new one."""
+    """C function that stores the passage of a gate; a new load replaces the oldest one."""
     if not code.gate_loads:
         return ""
     return f"""
@@ -296,7 +296,7 @@ void {name}_gate({name}_state *s, int gate, real t)
 
 
 def _missing_lines(code: ProgramText) -> str:
-    """What a step does where a reading is missing, as lines of a comment."""
+    """Lines of a comment on what a step does where a reading is missing."""
     sentences = [
         "A reading that is no number, or outside the range of its sensor, is missing: give NAN for"
         " one that did not come in time, and call the step once a period even if none came; one"
@@ -309,7 +309,7 @@ def _missing_lines(code: ProgramText) -> str:
 
 
 def _reset_lines(code: ProgramText) -> list[str]:
-    """Statements that set the state to its start."""
+    """C statements that set the state to its initial values."""
     lines, loops = [], False
     for name, part in code.members.items():
         values = array_text(part.start).split(", ")
@@ -328,7 +328,7 @@ def _type(values: np.ndarray) -> str:
 
 
 def _meaning(part: Member) -> str:
-    """What a member of the state is, by its address in the state of the program."""
+    """Meaning of a member of the state, from its address in the state of the program."""
     if part.address.startswith("settings."):
         return f"{part.address.removeprefix('settings.')}; settable"
     return part.address
@@ -355,5 +355,5 @@ def uses(body: str, word: str) -> bool:
 
 
 def _wrapped(text: str, width: int = 100) -> str:
-    """An array in lines of a width."""
+    """Text of an array, wrapped to lines of a width."""
     return "\n    ".join(textwrap.wrap(text, width - 4, break_long_words=False))

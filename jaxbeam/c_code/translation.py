@@ -1,7 +1,7 @@
-"""C99 of a program of JAX for one run: constants by name, no vectors, the cost at worst.
+"""Translation of a JAX program to C99 for one run: named constants, no vectors, worst-case cost.
 
-`jaxbeam.runtime.c_translation` has the rules; here is what a program for a real-time system needs
-beyond them.
+`jaxbeam.runtime.c_translation` has the rules; this module adds what programs for real-time systems
+need beyond them.
 """
 
 import math
@@ -29,7 +29,7 @@ from jaxbeam.runtime.interpreter import called_program
 from jaxbeam.runtime.native_library import C_FOLDER
 
 WIDTH = 100  # of the lines of C
-INDEX = "#"  # stands for the index in the form of an expression
+INDEX = "#"  # placeholder of the index in the text of an `Expression`
 QUADRATIC_PROGRAMS = "numerics/qp"  # whose tolerances depend on the precision
 PACKAGE = str(Path(__file__).parents[1])
 MACHINERY = str(Path(__file__).parents[1] / "runtime")
@@ -39,9 +39,9 @@ BY_POINTER = {
     "lu",
     "scan",
     "unstack",
-}  # rules that take addresses of inputs
-BY_PLACE = {"gather", "dynamic_slice"}  # that read their first input at places that are computed
-FREE = {  # that only move numbers, or are of truths and whole numbers
+}  # primitives whose rules take addresses of inputs
+BY_PLACE = {"gather", "dynamic_slice"}  # primitives that read their first input at computed indices
+FREE = {  # primitives that cost no operation: they move numbers, or act on booleans and indices
     *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev"),
     *("concatenate", "stack", "tile", "pad", "split", "unstack", "iota", "gather", "dynamic_slice"),
     *("dynamic_update_slice", "scatter", "convert_element_type", "copy", "stop_gradient"),
@@ -60,36 +60,39 @@ TAKEN = re.compile(  # names of the writer, words of C, of math.h, and of the pr
 
 
 class Word(CArray):
-    """A number by the text of it, at all places of an array."""
+    """Array with one value in all entries, whose name is the C text of the value."""
 
     def at(self, index: Any, varying: bool | None = None) -> str:
-        """Its text."""
+        """C text of the value, whatever the index."""
         return self.name
 
 
 class Number(Word):
-    """A number that is known."""
+    """Array with one constant in all entries."""
 
 
 class Expression(CArray):
-    """Entries of an array that are computed where they are used, which is once."""
+    """Array that is used once: its entries are computed there, without storage.
+
+    Its name is the C text of an entry, with INDEX in place of the index.
+    """
 
     def at(self, index: Any, varying: bool | None = None) -> str:
-        """Its text, of which the name is the form."""
+        """C text of the entry at an index."""
         return self.name.replace(INDEX, str(index))
 
 
 class ProgramWriter(Translation):
-    """Lines of C of a program whose constants are beside them.
+    """Writer of the C lines of a program, with its constants in a separate table.
 
-    What acts on each entry and is used once, by what acts on each entry too, becomes one line.
+    An elementwise operation that is used once, by another one, is written in the same line.
     """
 
     def __init__(self, names: dict[tuple, str]):
         super().__init__()
         self.names = names
         self.constants: dict[str, np.ndarray] = {}
-        self.told: str | None = None
+        self.last_place: str | None = None
         self.used_once: set = set()
         self.stack_bytes = 0
 
@@ -106,12 +109,12 @@ class ProgramWriter(Translation):
         )
 
     def declare(self, kind: str, shape: Sequence[int], varying: bool) -> CArray:
-        """A new array, on the stack."""
+        """New array on the stack."""
         self.stack_bytes += math.prod(shape) * (8 if kind == "d" else 4)
         return super().declare(kind, shape, varying)
 
     def constant(self, array: np.ndarray) -> CArray:
-        """An array of known numbers, the same one for the same numbers."""
+        """Constant array of some numbers; arrays of equal numbers are stored once."""
         kind = kind_of(array)
         if array.size == 1:
             text = number_text(array.ravel().tolist()[0])
@@ -124,7 +127,7 @@ class ProgramWriter(Translation):
         return CArray(kind, array.shape, name, False)
 
     def run(self, closed, inputs: Sequence[CArray]) -> list[CArray]:
-        """Write the equations of a jaxpr; its outputs are arrays."""
+        """Outputs of a jaxpr as stored arrays, after its equations are written."""
         jaxpr = getattr(closed, "jaxpr", closed)
         uses = Counter(atom for atom in jaxpr.outvars if not hasattr(atom, "val"))
         single = {}
@@ -138,13 +141,13 @@ class ProgramWriter(Translation):
         return [self._stored(value) for value in super().run(closed, inputs)]
 
     def equation(self, equation, values: list[CArray]) -> list[CArray]:
-        """Write an equation under the name of the function that it is of."""
+        """Outputs of an equation, written below a comment with the function that it is from."""
         name = equation.primitive.name
         if called_program(equation) is not None:
             return super().equation(equation, values)
         place = _place(equation)
-        if self.depth == 1 and place not in (None, self.told):
-            self.told = place
+        if self.depth == 1 and place not in (None, self.last_place):
+            self.last_place = place
             self.line(f"/* {place} */")
         if place is not None and place.startswith(QUADRATIC_PROGRAMS):
             values = [_by_precision(value) for value in values]
@@ -166,17 +169,17 @@ class ProgramWriter(Translation):
         return [Expression(kind_of(out), out.shape, f"({text.format(*entries)})", False)]
 
     def varies(self, closed, inputs: Sequence[CArray]) -> list[bool]:
-        """Nothing differs between runs, as there is one."""
+        """False for each output: there is one run, so that nothing differs between runs."""
         return [False] * len(getattr(closed, "jaxpr", closed).outvars)
 
     def converted(self, value: CArray, kind: str) -> CArray:
-        """An array of another kind; of numbers beyond the whole ones the nearest."""
+        """Array converted to another kind; numbers beyond the range of integers are clipped."""
         if value.kind + kind == "di":
             return self.each("whole({})", "i", value.shape, [value], False)
         return super().converted(value, kind)
 
     def _stored(self, value: CArray, also_words: bool = False) -> CArray:
-        """An array in memory for one that is written where it is used."""
+        """Stored array with the entries of an `Expression`, or of a `Word` if asked for."""
         if isinstance(value, Expression) or (also_words and isinstance(value, Word)):
             return self.each("{}", value.kind, value.shape, [value], False)
         return value
@@ -191,7 +194,7 @@ def _array(number: Number) -> np.ndarray:
 
 
 def _by_precision(value: CArray) -> CArray:
-    """A tolerance of quadratic programs, by the precision of the program."""
+    """Value that depends on the precision of the program, for tolerances of quadratic programs."""
     if isinstance(value, Number) and value.kind == "d":
         number = float(_array(value).flat[0])
         if number in SINGLE_PRECISION:
@@ -201,7 +204,7 @@ def _by_precision(value: CArray) -> CArray:
 
 
 def _form(equation, values: list[CArray]) -> str | None:
-    """Form of what acts on each entry of arrays of one size, or numbers; None of another."""
+    """Format of the C text of an elementwise operation on arrays or numbers; else None."""
     name = equation.primitive.name
     rule = None if name in Translation.rules else elementwise(name, equation.params)
     size = equation.outvars[0].aval.size
@@ -214,7 +217,7 @@ def _form(equation, values: list[CArray]) -> str | None:
 
 
 def _joins(atom, equation) -> bool:
-    """Whether an equation acts on each entry of what is read, and has as many."""
+    """Whether an equation is an elementwise operation on an atom of its own size."""
     return (
         equation.primitive.name not in Translation.rules
         and elementwise(equation.primitive.name, equation.params) is not None
@@ -223,19 +226,19 @@ def _joins(atom, equation) -> bool:
 
 
 def without_unused(closed):
-    """A program of JAX without what no output makes use of, also within its loops."""
+    """JAX program without the equations that no output depends on, also within its loops."""
     jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
     return closed.replace(jaxpr=jaxpr)
 
 
 def fingerprint(array) -> tuple:
-    """What tells arrays of other numbers apart."""
+    """Hashable key of the kind, size and numbers of an array."""
     array = np.asarray(array)
     return array.dtype.kind, array.size, array.tobytes()
 
 
 def _place(equation) -> str | None:
-    """Function of jaxbeam, or of a user, that an equation was written in, None if not known."""
+    """Name of the function, of jaxbeam or a user, that an equation is from; None if unknown."""
     frames = getattr(getattr(equation.source_info, "traceback", None), "frames", ())
     for frame in frames:
         file = frame.file_name
@@ -248,7 +251,7 @@ def _place(equation) -> str | None:
 
 
 def _plain(function: str) -> str:
-    """Name of a function without those within it that have none."""
+    """Name of the outermost function around a local one."""
     return function.split(".<locals>")[0]
 
 
@@ -261,11 +264,11 @@ def in_single_type(text: str) -> str:
 
 def functions_of(text: str) -> list[str]:
     """Texts of the functions that a text calls, each after those that it calls itself."""
-    known = {re.search(r"(\w+)\(", one)[1]: one for one in _functions()}  # type: ignore[index]
+    texts = {re.search(r"(\w+)\(", one)[1]: one for one in _functions()}  # type: ignore[index]
     found: dict[str, str] = {}
 
     def add(part: str) -> None:
-        for name, own in known.items():
+        for name, own in texts.items():
             if name not in found and re.search(rf"\b{name}\(", part):
                 add(own.split("{", 1)[1])
                 found[name] = own
@@ -299,7 +302,7 @@ SMALL = [
 
 
 def operations(jaxpr) -> int:
-    """Operations of a program at worst: arithmetic and comparisons of numbers, functions of math.h.
+    """Worst-case number of operations of a program: arithmetic, comparisons, functions of math.h.
 
     Raises UntranslatedError for a loop without a largest number of turns.
     """
@@ -366,7 +369,7 @@ def _open(closed):
 
 
 def _most_turns(condition) -> int:
-    """Number with which the condition of a loop compares its counter."""
+    """Largest number of turns of a loop: the number that its condition compares with."""
     for equation in condition.eqns:
         if equation.primitive.name == "lt" and hasattr(most := equation.invars[1], "val"):
             return int(most.val)
@@ -374,7 +377,7 @@ def _most_turns(condition) -> int:
 
 
 def named_arrays(leaves: Sequence[tuple[Any, Any]]) -> dict[tuple, str]:
-    """Names of arrays, and of their rows, by what tells them apart, from their addresses."""
+    """Names of arrays and of their rows by `fingerprint`, made from their addresses."""
     found: dict[tuple, str] = {}
     for path, leaf in leaves:
         if not hasattr(leaf, "dtype") or np.asarray(leaf).dtype.kind not in "fiub":
