@@ -18,7 +18,7 @@ STEP_OF_FASTEST = 0.1  # of a radian of the fastest mode, the longest step of Ma
 
 
 class BeamSteps:
-    """Beam, supports, actuators and loads of a case, in time from rest at t = 0.
+    """Beam, supports, actuators and loads of a case, integrated step by step from rest at t = 0.
 
     Commands are held over a step of any length, within the limits of the actuators. Steps are
     split where wheels enter and leave the beam, and go by Magnus' method of order 4 in between;
@@ -74,7 +74,7 @@ class BeamSteps:
         self.time = 0.0
 
     def step(self, duration: float, commands: ArrayLike | None = None) -> None:
-        """Step over a time (s) under commands (V, A or N), those of the last step if None.
+        """Advance by a `duration` (s) under `commands` (V, A or N), the last ones if None.
 
         Raises ValueError for a duration that is not positive.
         """
@@ -96,7 +96,7 @@ class BeamSteps:
         return np.asarray(system.C @ self._state + system.D @ self.commands)
 
     def _advance(self, start: float, end: float) -> None:
-        """State at the end of a smooth interval (s)."""
+        """Advance the state over an interval (s) without events."""
         steps = max(1, math.ceil((end - start) / self._longest))
         span = (end - start) / steps
         size, actuators = self._state.size, self.commands.size

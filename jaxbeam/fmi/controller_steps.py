@@ -71,9 +71,9 @@ class ControllerSteps:
         self._check_state()
 
     def step(self, time: float, readings: ArrayLike) -> Float[np.ndarray, " actuator"]:
-        """Commands that act from a time (s) on, with a sample of the readings if one is due then.
+        """Commands that act from a time (s) on, after a sample of the readings if one is due then.
 
-        Times do not fall. Raises ValueError if a sample was passed over.
+        Times must not decrease. Raises ValueError if a sample was skipped.
         """
         due, tolerance = self._sample * self._period, CLOCK_TOLERANCE * self._period
         if time > due + tolerance:
@@ -89,7 +89,7 @@ class ControllerSteps:
         return self.commands
 
     def _take_sample(self, due: float, readings) -> None:
-        """Step of the law at a sample, whose commands wait for the delay."""
+        """Step the law at the sample due; its commands begin after the delay."""
         present = np.abs(readings) <= MAX_READING
         for i in np.flatnonzero(present):
             self._readings[i], self._filters[i] = filtered_reading(
@@ -109,7 +109,7 @@ class ControllerSteps:
         self._sample += 1
 
     def _restart(self) -> None:
-        """Law, filters and readings at rest."""
+        """Set law, filters and readings to rest."""
         pairs = list(zip(self._sensors, self._sections, strict=True))
         self._state = self._law.initial_state()
         self._filters = [initial_filter_state(*pair, np.zeros(())) for pair in pairs]
