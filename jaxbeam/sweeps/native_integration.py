@@ -81,10 +81,10 @@ class TranslatedLoop(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """C code of the events of loops of one structure: what is given to it, and what they share.
+    """C code of the events of loops of one structure: its arguments, and the parts they share.
 
-    `given` tells which of the `constants` and numbers of a loop are arguments; `rest` is what is
-    no number in a loop, `kinds` are shapes and types of its numbers.
+    `given` flags the `constants` and numbers of a loop that are arguments; `rest` are the parts of
+    a loop that are no numbers, `kinds` shapes and types of its numbers.
     """
 
     text: str
@@ -95,7 +95,7 @@ class _Program(NamedTuple):
 
 
 def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
-    """Events of loops in C; those that differ in numbers alone share a program.
+    """Events of loops in C; loops that differ in numbers alone share a program.
 
     Raises UntranslatedError for a loop with a part that is not translated: accelerations, which
     follow from the contact forces, and a law with other functions than `c_translation` has.
@@ -119,7 +119,7 @@ def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
 
 
 def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Program:
-    """The program of a loop, from its numbers, what is no number, and its memory at the start."""
+    """Program of a loop, from its numbers, its other parts, and its initial memory."""
     if loop.measured_rows is not None:
         raise UntranslatedError("readings of accelerations")
 
@@ -140,7 +140,7 @@ def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Pr
 
 
 def _is_number(leaf: Any) -> bool:
-    """Whether a leaf is a number that another loop of the same structure may have otherwise."""
+    """Whether a leaf is a number, which may differ between loops of the same structure."""
     if isinstance(leaf, np.ndarray | np.generic | jax.Array):
         return np.issubdtype(leaf.dtype, np.floating)
     return isinstance(leaf, float)
@@ -188,7 +188,7 @@ def _loaded(writer: Writer, stored: CArray, kind: str) -> CArray:
 
 
 class NativeLoops:
-    """Sampled loops of the batches of a sweep in C, whose law is designed once where it is one.
+    """Sampled loops of the batches of a sweep in C; a law that all batches share is designed once.
 
     All share the `model` of the beam. Raises NotVectorisedError where a loop cannot be translated
     or compiled.
@@ -220,7 +220,7 @@ class NativeLoops:
         )
 
     def model_inputs(self, histories: bool) -> dict[str, Any]:
-        """Those of the `NativeInputs` that the model of the loop determines, which all share."""
+        """Fields of `NativeInputs` that depend on the model of the loop, which all share."""
         assert self._filtered is not None
         case, model = self.program.case, self._filtered[0]
         rows = history_rows(case, model) if histories else None
@@ -323,7 +323,7 @@ class NativeBatches:
     def __init__(
         self,
         program: Program,
-        known: SharedModel,
+        shared: SharedModel,
         events: PathEvents,
         batches: Batches,
         block_size: int,
@@ -332,16 +332,16 @@ class NativeBatches:
     ):
         self.program, self.batches, self.schedule = program, batches, schedule
         self.block_size, self.most_at_once = block_size, most_at_once
-        self.shared_model, self.loops = known, None
+        self.shared_model, self.loops = shared, None
         self._load_set = functools.cache(self._load_set_of)
         self.events = events, values_at(program.case, batches, "run.duration")
         with np.errstate(all="ignore"):  # as in compiled code
             if program.schedule is None:
-                of_model = native_peaks.model_inputs(known.model, *known.outputs)
+                of_model = native_peaks.model_inputs(shared.model, *shared.outputs)
                 if schedule is not None:
-                    of_model["history_rows"] = history_rows(program.case, known.model)
+                    of_model["history_rows"] = history_rows(program.case, shared.model)
             else:
-                self.loops = NativeLoops(program, batches, known.model)
+                self.loops = NativeLoops(program, batches, shared.model)
                 of_model = self.loops.model_inputs(schedule is not None)
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
