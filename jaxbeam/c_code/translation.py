@@ -4,6 +4,7 @@
 need beyond them.
 """
 
+import functools
 import math
 import re
 import sysconfig
@@ -48,14 +49,14 @@ FREE = {  # primitives that cost no operation: they move numbers, or act on bool
     *("platform_index", "select_n", "and", "or", "not", "xor", "reduce_or", "reduce_and"),
 }
 STANDARD_LIBRARY = sysconfig.get_path("stdlib")
-TAKEN = re.compile(  # names of the writer, words of C, of math.h, and of the program itself
+TAKEN = re.compile(  # names of the writer, words of C, of math.h, and of the step of a program
     r"[a-z]\d*"
     "|auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if"
     "|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef"
     "|union|unsigned|void|volatile|while"
     "|sqrt|cbrt|exp|expm1|log|log1p|sin|cos|tan|sinh|cosh|tanh|asin|acos|atan|atan2|pow|fmod"
     "|floor|ceil|rint|round|fabs|gamma|abs|labs|llabs"
-    "|real|commands|measurements|larger|smaller|within|whole|power|factor|eliminate|decompose"
+    "|real|commands|measurements"
 )
 
 
@@ -291,6 +292,12 @@ def _functions() -> list[str]:
     return [*SMALL, *(part[: part.rindex("\n}") + 2] for part in parts)]
 
 
+@functools.cache
+def _names_in_functions() -> frozenset[str]:
+    """Names of these functions, and of all that is declared in them, which would be shadowed."""
+    return frozenset(re.findall(r"\w+", "\n".join(_functions())))
+
+
 SMALL = [
     "static real larger(real a, real b)\n{\n    return a > b || !(a == a) ? a : b;\n}",
     "static real smaller(real a, real b)\n{\n    return a < b || !(a == a) ? a : b;\n}",
@@ -396,7 +403,7 @@ def last_word(path) -> str:
     ]
     place = max((i for i, word in enumerate(words) if not word.isdecimal()), default=0)
     word = re.sub(r"\W", "", "_".join(words[place:])).strip("_") or "value"
-    return f"{word}_" if TAKEN.fullmatch(word) else word
+    return f"{word}_" if TAKEN.fullmatch(word) or word in _names_in_functions() else word
 
 
 def with_numbers(names: dict[Any, str]) -> dict[Any, str]:
