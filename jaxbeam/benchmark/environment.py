@@ -53,7 +53,7 @@ class HeldMaps(NamedTuple):
 
 
 class EnvironmentState(NamedTuple):
-    """State of an environment; all of it is arrays.
+    """State of an environment, a tree of arrays.
 
     `load` are the numbers of the load, `step` is that of the period, `plant` the state of beam,
     analogue filters and vehicles, `peak` (m) the largest absolute deflection so far, `uncontrolled`
@@ -71,7 +71,7 @@ class EnvironmentState(NamedTuple):
 
 
 class _SteppedLoop(SampledLoop):
-    """Sampled loop whose commands come from outside, event by event."""
+    """Sampled loop that is advanced event by event, with commands from outside."""
 
     def read(self, memory: LoopMemory, state, event):
         """Memory after the samples of sensors at an event, and the available readings."""
@@ -80,7 +80,7 @@ class _SteppedLoop(SampledLoop):
         return memory, self._available_readings(readings, event)[:, 0]
 
     def passed(self, memory: LoopMemory, state, event, reads: bool) -> LoopMemory:
-        """Memory after an event, if it is one: samples of sensors, a command that begins."""
+        """Memory after an event: samples of sensors, a command that begins; unchanged for none."""
         is_event, event = event >= 0, jnp.maximum(event, 0)
         after = self.read(memory, state, event)[0] if reads else memory
         age = jnp.asarray(self.schedule.command_age)[event]
@@ -96,8 +96,8 @@ class _Event(NamedTuple):
 class Environment(Module):
     """Environment of a problem: `reset` and `step` are pure functions of arrays.
 
-    An observation has the readings of the sensors (their SI units), the share of the run that has
-    passed, and, in a problem that tells its load, the numbers of the load as shares of their
+    An observation has the readings of the sensors (their SI units), the elapsed fraction of the
+    run, and, in a problem that tells its load, the numbers of the load as fractions of their
     ranges. An action has a command for each actuator that takes any, in its unit; the loop rounds
     and limits it. Rewards are minus the growth of the peak over the peak without commands: their
     sum is minus the ratio of the peaks, which orders runs of a load as the score does.
@@ -205,7 +205,7 @@ class Environment(Module):
         return dataclasses.replace(self.loop, noise=state.noise)
 
     def _observed(self, state: EnvironmentState, period):
-        """The state after the samples of the sensors at the start of a period; observation."""
+        """State after the samples of the sensors at the start of a period, and observation."""
         event = jnp.asarray(self.controls)[period]
         memory, readings = self._loop(state).read(state.memory, state.plant[:, None], event)
         parts = [readings, (state.step / self.steps)[None]]
@@ -302,7 +302,7 @@ def _advance(maps: HeldMaps, period, interval: int, plant, command):
 
 
 def _check(case: Case) -> None:
-    """Raises ValueError for what an environment does not take."""
+    """Check that an environment can be made of a case. Raises ValueError if not."""
     controller = case.controller
     if controller is None or controller.period is None:
         raise ValueError(REFUSED.format("controller"))
@@ -315,7 +315,7 @@ def _check(case: Case) -> None:
 
 
 def _periods(schedule: EventSchedule):
-    """Events of the control samples, starts of intervals by period, samples by period."""
+    """Events of the control samples, and starts of intervals and samples of each period."""
     control, age = np.asarray(schedule.control_sample), np.asarray(schedule.command_age)
     acts = (control >= 0) | (age >= 0) | (np.asarray(schedule.reading) >= 0).any(axis=1)
     controls = np.flatnonzero(control >= 0)

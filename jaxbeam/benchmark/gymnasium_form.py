@@ -18,7 +18,7 @@ except ImportError as error:
 
 
 class GymnasiumEnvironment(gymnasium.Env):
-    """Environment of gymnasium around an `Environment`, whose observations and rewards it has.
+    """Environment of gymnasium with the observations and rewards of an `Environment`.
 
     Actions are from -1, the lowest command of an actuator, over 0, none, to 1, the highest one.
     `reset(seed=...)` is a run of that seed, with its test load; `options={"load": numbers}` is one

@@ -23,12 +23,12 @@ LOAD_STREAM = 2**20  # of random numbers: those of the sensors' noise are number
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BenchmarkProblem:
-    """A problem: its case, whose controller is the baseline, and what varies from run to run.
+    """Problem: a case, whose controller is the baseline, and the loads that differ between runs.
 
     `vary` maps addresses of the case to the lowest and highest number (SI units). The score counts
     the deflection at `positions` (m) at the samples of the run. `training` are the numbers of loads
-    for training. A law is designed for the load of the run where it is `told`, else for that of the
-    case. At most `max_loads` wheels are on the beam at once.
+    for training. If the load is `told`, a law is designed for the load of the run, else for that of
+    the case. At most `max_loads` wheels are on the beam at once.
     """
 
     name: str
@@ -52,17 +52,17 @@ class BenchmarkProblem:
         return float(controller.period)
 
     def numbers(self, shares: Float[Array, " number"]) -> Float[Array, " number"]:
-        """Numbers of a load (SI units) from shares of their ranges, 0 to 1."""
+        """Numbers of a load (SI units) at fractions (`shares`, 0 to 1) of their ranges."""
         low, high = np.array(list(self.vary.values())).T
         return low + (high - low) * shares
 
     def shares(self, numbers: Float[Array, " number"]) -> Float[Array, " number"]:
-        """Shares of the ranges from the numbers of a load."""
+        """Fractions of the ranges, 0 to 1, at which the numbers of a load are."""
         low, high = np.array(list(self.vary.values())).T
         return (numbers - low) / (high - low)
 
     def test_load(self, seed: int) -> Float[np.ndarray, " number"]:
-        """Numbers of the load of a seed, equally distributed over their ranges."""
+        """Numbers of the test load of a seed, uniformly distributed over their ranges."""
         return np.asarray(self.numbers(uniform_samples(seed, (LOAD_STREAM,), len(self.vary))))
 
     def with_load(self, case: Case, numbers: Float[Array, " number"]) -> Case:
@@ -87,9 +87,9 @@ def names() -> tuple[str, ...]:
 
 @functools.cache
 def load(name: str) -> BenchmarkProblem:
-    """The problem of a name.
+    """Benchmark problem of a name.
 
-    Raises ValueError for a name of none.
+    Raises ValueError for an unknown name.
 
     >>> import jaxbeam as jb
     >>> problem = jb.benchmark.load("unknown_mass")

@@ -1,4 +1,4 @@
-"""Scores: the share of the attainable reduction of the peak, by the bound of each load.
+"""Scores: shares of the attainable reduction of the peak, from the bound of each load.
 
 A share is (uncontrolled - peak) / (uncontrolled - bound), with the largest absolute deflections at
 the positions of the problem and the samples of the run, and `jaxbeam.bound` at the same. It is 0
@@ -57,12 +57,12 @@ class Score(Module):
 
     @property
     def mean(self) -> float:
-        """The score: mean share, where a run that diverges counts LEAST_SHARE, as any worse one."""
+        """Score: the mean share, in which a run counts at least LEAST_SHARE, if it diverges too."""
         return float(np.mean(np.fmax(self.shares, LEAST_SHARE)))
 
     @property
     def worst(self) -> float:
-        """Least share."""
+        """Smallest share, at least LEAST_SHARE."""
         return float(np.min(np.fmax(self.shares, LEAST_SHARE)))
 
 
@@ -111,7 +111,7 @@ def score(
 
 
 def check_controller(problem: BenchmarkProblem, controller: AbstractController) -> None:
-    """Raises ValueError for a controller that is not one of a problem, as `score` says."""
+    """Check that a controller suits a problem. Raises ValueError as `score` does."""
     for name in SAME:
         own, given = getattr(problem.case.controller, name), getattr(controller, name)
         if (own is None) != (given is None) or (own is not None and float(own) != float(given)):
@@ -125,7 +125,7 @@ def check_controller(problem: BenchmarkProblem, controller: AbstractController) 
 
 
 def design_case(problem: BenchmarkProblem, controller: AbstractController, case: Case) -> Case:
-    """The case of a run under a controller, designed for what the problem tells of the load."""
+    """Case of a run under a controller, designed for the load if the problem tells it."""
     if not problem.told:
         controller = dataclasses.replace(controller, nominal_plant=state_space(problem.case))
     return dataclasses.replace(case, controller=controller)
@@ -161,7 +161,7 @@ def _peaks_under_policy(
 
 
 def attainable(problem: BenchmarkProblem, seed: int) -> Attainable:
-    """What is attainable for the test load of a seed: as stored, or computed if it is not."""
+    """Attainable peak for the test load of a seed: the stored one, or else computed."""
     stored = published(problem.name)["test"]
     if seed in TEST_SEEDS and len(stored) == len(TEST_SEEDS):
         return stored[TEST_SEEDS.index(seed)]
@@ -171,7 +171,7 @@ def attainable(problem: BenchmarkProblem, seed: int) -> Attainable:
 def compute_attainable(
     problem: BenchmarkProblem, numbers: Float[np.ndarray, " number"]
 ) -> Attainable:
-    """What is attainable for a load of these numbers."""
+    """Attainable peak for the numbers of a load, computed."""
     case = dataclasses.replace(problem.run_case(numbers), controller=None)
     positions = np.array(problem.positions)
     least = bound(case, positions=positions, period=problem.period)
@@ -185,7 +185,7 @@ def compute_attainable(
 
 @functools.cache
 def published(name: str) -> dict[str, list[Attainable]]:
-    """What is attainable for the loads of a problem, of "training" and "test", as stored."""
+    """Stored attainable peaks for the "training" and the "test" loads of a problem."""
     return {
         kind: [Attainable(*map(_as_stored, row)) for row in rows]
         for kind, rows in _stored("bounds").get(name, {"training": [], "test": []}).items()
@@ -193,7 +193,7 @@ def published(name: str) -> dict[str, list[Attainable]]:
 
 
 def baselines() -> dict[str, Score]:
-    """Scores of the baselines by problem, as stored.
+    """Stored scores of the baselines by problem.
 
     >>> import jaxbeam as jb
     >>> print(f"{jb.benchmark.baselines()['patch'].mean:.0%}")
@@ -207,7 +207,7 @@ def baselines() -> dict[str, Score]:
 
 
 def clear() -> None:
-    """Read what is stored again, which has changed."""
+    """Clear the caches, so that stored bounds and baselines are read again."""
     published.cache_clear()
     _stored.cache_clear()
 
