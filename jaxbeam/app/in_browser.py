@@ -10,7 +10,7 @@ FOLDER = Path("cases")  # of the file system that the browser forgets
 
 
 class Page:
-    """The page of a folder, with the question by name and JSON, and the answer as bytes."""
+    """Page of a folder: takes questions by name and JSON, returns answers as bytes."""
 
     def __init__(self, folder: Path = FOLDER):
         folder.mkdir(exist_ok=True)
@@ -19,10 +19,10 @@ class Page:
         self._questions = questions(self._workspace)
 
     def ask(self, name: str, text: str) -> tuple[bool, bytes, str, str]:
-        """Whether it was answered, the answer or the problem, its media type, and a file's name."""
+        """Whether a question was answered, the answer or problem, its media type, a file name."""
         answered, content = answer(self._questions[name], text)
         return answered, content.body, content.kind, content.name or ""
 
     def close(self) -> None:
-        """Forget logs and work."""
+        """Cancel all work and remove the logs."""
         self._workspace.close()

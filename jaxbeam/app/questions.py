@@ -1,4 +1,4 @@
-"""Questions of the page and their answers, whatever carries them: the server, or a worker.
+"""Requests of the page ("questions") and their answers, through the server or a web worker.
 
 A question is a name and a table; an answer a table, or bytes with their media type.
 """
@@ -18,7 +18,7 @@ from jaxbeam.library.published import trains
 
 
 class Content(NamedTuple):
-    """An answer in bytes, with its media type, and the name of a file that is taken away."""
+    """Answer in bytes, with its media type, and a file name if it is downloaded."""
 
     body: bytes
     kind: str
@@ -42,7 +42,7 @@ def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Conten
 def questions(
     workspace: Workspace, opened: str | None = None
 ) -> dict[str, Callable[[dict[str, Any]], Any]]:
-    """Functions that answer the questions about a workspace, with a file of it `opened` first."""
+    """Functions that answer questions about a workspace, by name; `opened` is its first file."""
 
     def hello(_) -> dict[str, Any]:
         return {
@@ -109,7 +109,7 @@ def questions(
 
 
 def answer(work: Callable[[dict[str, Any]], Any], text: str | bytes) -> tuple[bool, Content]:
-    """Whether a question in JSON could be answered, and its answer or the problem, as bytes."""
+    """Whether a question in JSON was answered, and its answer or the problem, as bytes."""
     try:
         found = work(_question(text))
     except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
@@ -127,7 +127,7 @@ def _question(text: str | bytes) -> dict[str, Any]:
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """What went wrong, in words for the page."""
+    """Message and address of an error, as data for the page."""
     problem = jb.api.problem(error)._asdict()
     if isinstance(error, KeyError):
         problem["message"] = f"the question lacks {error}"
@@ -135,6 +135,6 @@ def problem_of(error: Exception) -> dict[str, Any]:
 
 
 def as_json(found: Any) -> Content:
-    """An answer of plain data."""
+    """Answer in JSON, of plain data."""
     body = json.dumps(jb.api.plain(found), ensure_ascii=False, allow_nan=False)
     return Content(body.encode(), "application/json")

@@ -37,7 +37,7 @@ HEADERS = {
 
 
 class Guard:
-    """Refuses what does not come from the page itself: other hosts, other origins, no token.
+    """Middleware that refuses requests of other pages: other hosts, other origins, no token.
 
     The `Host` is compared against rebinding of names, the `Origin` and `Sec-Fetch-Site` against
     other pages in the same browser. Bodies above the limit are refused before they are read.
@@ -81,7 +81,7 @@ class Guard:
         await self._app(scope, limited, with_headers)
 
     def _refusal(self, request: Request) -> tuple[int, str] | None:
-        """Status and sentence for a question that is refused."""
+        """Status and sentence for a request that is refused; None for one that is allowed."""
         headers = request.headers
         host = headers.get("host", "")
         if host not in self._hosts:
@@ -104,7 +104,7 @@ class Guard:
 
 
 def _most_bytes(request: Request) -> int:
-    """Largest size of what may be sent: logs may be longer than cases."""
+    """Largest size (bytes) of a request: logs may be longer than cases."""
     return MAX_LOG_BYTES if request.url.path == LOG_PATH else MAX_BYTES
 
 
@@ -125,7 +125,7 @@ def _asked(work: Callable[[dict[str, Any]], Any]) -> Callable[[Request], Any]:
 
 
 def application(workspace: Workspace, opened: str | None, token: str, port: int) -> Any:
-    """The ASGI application of a page for a workspace, with a file of it `opened` first."""
+    """ASGI application of the page of a workspace, whose file `opened` is shown first."""
 
     def index(_) -> Response:
         return Response((STATIC / "index.html").read_bytes(), media_type="text/html")

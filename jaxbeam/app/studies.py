@@ -1,4 +1,4 @@
-"""Sweeps, fits, comparisons and tunings of the page: work whose results are seen as it goes on."""
+"""Sweeps, fits, comparisons and tunings of the page, whose partial results are shown at work."""
 
 import dataclasses
 import re
@@ -22,7 +22,7 @@ LOG_ENDINGS += (".unv", ".parquet", ".lvm", ".nc", ".xlsx", ".toml")
 
 
 def axis_values(case: Case, axis: Mapping[str, Any]) -> list[Any]:
-    """Values of an axis of a sweep: words, or so many numbers from one to another, also with units.
+    """Values of an axis of a sweep: words, or equidistant numbers of a range, also with units.
 
     Raises ValueError for an axis without two values and for numbers that cannot be read.
     """
@@ -42,10 +42,10 @@ def axis_values(case: Case, axis: Mapping[str, Any]) -> list[Any]:
 
 
 class Sweep:
-    """A sweep over one or two addresses, row by row, each row once it is known.
+    """Sweep over one or two addresses, whose rows are shown as they are computed.
 
-    The rows are those of the words, or else of the second address; what is `found` of a row are
-    the columns of its table (`jaxbeam.files.tables`).
+    The rows are those of the words, or else of the second address; `found` has the columns of the
+    table (`jaxbeam.files.tables`) of each row so far.
     """
 
     def __init__(self, case: Case, axes: Sequence[Mapping[str, Any]]):
@@ -79,7 +79,7 @@ class Sweep:
             self.found.append(peaks)
 
     def state(self, known: int, name: str) -> dict[str, Any]:
-        """Axes, rows beyond those that are known, and words to compute it again for a file."""
+        """Axes, rows from index `known` on, and Python and command of the sweep for a file."""
         unit = {
             a: "" if isinstance(v[0], str) else unit_at(self.case, a)
             for a, v in self.values.items()
@@ -94,7 +94,7 @@ class Sweep:
         }
 
     def words(self, name: str) -> dict[str, str]:
-        """The same sweep in Python and on the command line, for a case in a file of some name."""
+        """Texts of the same sweep in Python and as a command, for a case in a file of a name."""
         python, command = [], []
         for address, values in self.values.items():
             if isinstance(values[0], str):
@@ -112,7 +112,7 @@ class Sweep:
 
 
 def keep_log(folder: Path, name: str, content: bytes) -> Path:
-    """Keep an uploaded log, or its description, under its own name in a folder of its own.
+    """Path of an uploaded log, or its description, stored under its name in a folder of its own.
 
     Raises ValueError for a name that no log has.
     """
@@ -163,10 +163,9 @@ def _spread(count: int) -> np.ndarray:
 
 
 class PageFit:
-    """A fit of free numbers of a case, each with bounds (also with units) or None, to logs.
+    """Fit of free numbers of a case, each with bounds (also with units) or None, to logs.
 
-    Each point that its search tries is seen: its numbers, its misfit, and the readings that it
-    predicts beside those that were measured.
+    Each point of its search is shown: numbers, misfit, and predicted beside measured readings.
     """
 
     def __init__(self, case: Case, logs: Sequence[Any], free: Mapping[str, Any]):
@@ -180,7 +179,7 @@ class PageFit:
             self.bounds[address] = pair
 
     def run(self) -> dict[str, Any]:
-        """Values with intervals, remarks on what the data cannot see, and fitted readings."""
+        """Values with intervals, remarks on unobservable numbers, and fitted readings."""
         import tuning
 
         with following(self._see):
@@ -196,7 +195,7 @@ class PageFit:
         self.point = point
 
     def state(self, known: int, name: str) -> dict[str, Any]:
-        """The misfit of each point so far, and numbers and readings of the last, unless known."""
+        """Misfits so far; numbers and readings of the last point if there are more than `known`."""
         point = self.point
         if point is None or len(self.misfits) == known:
             return {"misfits": self.misfits}
@@ -208,7 +207,7 @@ class PageFit:
         }
 
     def _readings(self, data: Any, predicted: np.ndarray) -> dict[str, Any]:
-        """Measured and predicted readings of each log, and what their channels are."""
+        """Measured and predicted readings of each log, with names and units of channels."""
         from jaxbeam.case.sensors import sensor_labels
 
         runs = []
@@ -236,7 +235,7 @@ class PageFit:
 def modes(
     logs: Sequence[Any], band: Sequence[float] | None, choose: Sequence[float]
 ) -> dict[str, Any]:
-    """Modes of logs, the stabilisation diagram that they were chosen in, and their shapes.
+    """Modes of logs with their shapes, and the stabilisation diagram from which they are chosen.
 
     The `band` (Hz) is found if it is left out; of frequencies to `choose` (Hz) the nearest modes
     are kept, and no others.
@@ -274,7 +273,7 @@ def modes(
 
 
 def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
-    """Metrics and runs of controllers, without control, and with the least peak of any."""
+    """Metrics and runs of controllers, the run without control, and the least achievable peak."""
     from jaxbeam.analysis.compare import compare as compare_controllers
 
     found = compare_controllers(case, dict(controllers))
@@ -312,15 +311,15 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class PageTuning:
-    """A tuning of numbers of a controller or an absorber, each with bounds or None.
+    """Tuning of numbers of a controller or an absorber, each with bounds or None.
 
-    The number at `vary` is a share `spread` smaller, as it is, and as much larger in training, half
-    as much in the runs held out. Objective and numbers are seen after each step.
+    The number at `vary` is changed by the fractions -`spread`, 0 and `spread` in training, by half
+    of these in held-out runs. Objective and numbers are shown after each step.
     """
 
     def __init__(self, case: Case, free: Mapping[str, Any], vary: str, spread: float, steps: int):
         middle = float(concrete(jb.addresses(case)[vary]))
-        at = [{vary: middle * (1 + share * spread)} for share in (-1.0, 0.0, 1.0, -0.5, 0.5)]
+        at = [{vary: middle * (1 + part * spread)} for part in (-1.0, 0.0, 1.0, -0.5, 0.5)]
         self.case, self.training, self.held_out, self.steps = case, at[:3], at[3:], steps
         self.bounds = {
             address: None if pair is None else tuple(map(float, pair))
@@ -329,7 +328,7 @@ class PageTuning:
         self._seen: dict[str, Any] = {}
 
     def run(self) -> dict[str, Any]:
-        """Objective by step, best numbers, and their verdict on the runs held out."""
+        """Objective by step, best numbers, and the verdict on held-out runs."""
         import tuning
 
         runs = tuning.LoadCases(tuple(self.training), tuple(self.held_out))
@@ -349,5 +348,5 @@ class PageTuning:
         return dict(zip(self.bounds, map(float, values), strict=True))
 
     def state(self, known: int, name: str) -> dict[str, Any]:
-        """The objective of each step so far, and the best numbers."""
+        """Objective of each step so far, and the best numbers."""
         return self._seen

@@ -1,4 +1,4 @@
-"""What a reader takes away from the page: files, pictures, a report, and the same in words."""
+"""Downloads of the page: files, pictures, a report, and the same run in Python or as a command."""
 
 import shlex
 import tempfile
@@ -60,7 +60,7 @@ def _draw(record: "jb.Record", path: Path) -> None:
 
 
 def report(record: "jb.Record") -> str:
-    """A page to print: what the run is, its peaks and contact forces, the picture, the case."""
+    """HTML report of a run for printing: title, peaks, contact forces, picture and case."""
     from jaxbeam.files.case_file import case_to_dict
     from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, html
     from jaxbeam.plot import plot_record
@@ -107,7 +107,7 @@ def _short(value: Any) -> str:
 
 
 def words(workspace: Workspace, text: str, name: str | None) -> dict[str, str]:
-    """The same run as Python and as a command line, for a file of some name."""
+    """Texts of the same run in Python and as a command, for a case in a file of a name."""
     file = name or "case.toml"
     case = workspace.case(text)
     python = [

@@ -1,4 +1,4 @@
-"""What the page draws of a case and of a record: plain data, and arrays for the moving picture."""
+"""Drawings of the page as data: parts of a case, and arrays of a record for the animation."""
 
 from typing import Any
 
@@ -82,7 +82,7 @@ def _loads(case: Case) -> list[dict[str, Any]]:
 
 
 def vehicles() -> list[dict[str, Any]]:
-    """Vehicles of the library: names, masses (kg), and what to draw of them."""
+    """Vehicles of the library: names, masses (kg), and parts to draw."""
     found = []
     for name in vehicle_names():
         load = jb.vehicles.VehicleLoad(model=name, speed=1.0)
@@ -114,7 +114,7 @@ def _vehicle(drawn: DrawnVehicle, dofs: int) -> dict[str, Any]:
 
 
 def _spread(count: int, most: int) -> np.ndarray:
-    """Indices of at most so many of all samples, evenly, both ends among them."""
+    """Indices of at most `most` of `count` samples, evenly spaced, with both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
@@ -126,7 +126,7 @@ def _wheel_positions(case: Case, loads: LoadSet, record: Record, chosen) -> np.n
 
 
 def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """A record for the screen: words and numbers, and its arrays by name.
+    """Words and numbers of a record, and its arrays by name, reduced to a screen.
 
     `beam` (frame, x) is the deflection (m) at `x` (m) and `frameTimes` (s), `wheelPositions`
     (frame, wheel) and `bodies` (frame, dof) are those of the loads; `sensors` (time, sensor),

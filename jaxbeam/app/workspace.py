@@ -1,7 +1,7 @@
-"""A folder of case files, and what is computed for the text of one: no web in it.
+"""A folder of case files, and computations for the text of a case, independent of the web.
 
 Texts come with each question, so that two pages, or one that was loaded again, do not disturb each
-other; what was computed for a text is remembered for a while.
+other; the last results are cached by text.
 
 The text of a case file under changes: comments, order and units of what stays are kept.
 """
@@ -46,7 +46,7 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 
 
 def changed(text: str, changes: Iterable[Mapping[str, Any]], case: Case | None = None) -> str:
-    """The text of a case file after changes, one after the other.
+    """Text of a case file after changes, one after the other.
 
     A change is {"set": address, "to": value} or {"remove": address}. Addresses are the words of
     the file, as loads.0.speed; the one after the last of a list, with a table, adds to it. A number
@@ -113,7 +113,7 @@ def _table(content: Mapping[str, Any]) -> Table:
 
 
 def _as_before(old: Any, value: Any, address: str, case: Case | None) -> Any:
-    """A number in SI units as a text in the unit of the one before, if that had a unit."""
+    """Number in SI units, as a text in the unit of the old value if that had a unit."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if case is None or not is_number or not is_quantity(old):
         return value
@@ -156,13 +156,13 @@ _STARTERS = resources.files("jaxbeam") / "files" / "starters"
 
 
 class Remembered:
-    """What was computed for the last few keys."""
+    """Cache of results for the last few keys."""
 
     def __init__(self, size: int = KEPT):
         self._size, self._found = size, collections.OrderedDict()
 
     def get(self, key: Any, compute: Any) -> Any:
-        """What is known for a key, computed if it is not."""
+        """Result for a key, computed by `compute` if it is not cached."""
         if key not in self._found:
             self._found[key] = compute()
         self._found.move_to_end(key)
@@ -205,7 +205,7 @@ class Workspace:
         return path
 
     def read(self, name: str) -> dict[str, Any]:
-        """Text of a case file, and a mark by which a later change of the file is seen.
+        """Text of a case file, and a mark (hash) that reveals a later change of the file.
 
         Raises ValueError for a place outside the folder and for a file that is too large.
         """
@@ -261,7 +261,7 @@ class Workspace:
         return self._cases.get(text, lambda: jb.api.load_case(text, folder=self.folder))
 
     def model(self, text: str) -> dict[str, Any]:
-        """Tables of a text, and what is to be seen of its case, or what is wrong with it.
+        """Tables of a text, and the picture and numbers of its case, or the error in it.
 
         `numbers` are those of the case by address, with units and words.
         """
@@ -291,7 +291,7 @@ class Workspace:
         return jb.api.plain(found)
 
     def change(self, text: str, changes: Iterable[Mapping[str, Any]]) -> str:
-        """The text after changes; see `changed`."""
+        """Text after changes; see `changed`."""
         try:
             case = self.case(text)
         except ValueError:  # it is being mended
@@ -301,7 +301,7 @@ class Workspace:
     # Runs
 
     def record(self, text: str) -> "jb.Record":
-        """The run of a case."""
+        """Record of the run of the case of a text."""
 
         def compute():
             with warnings.catch_warnings():
@@ -314,7 +314,7 @@ class Workspace:
     def simulator(
         self, case: Case, values: Mapping[str, float], ranges: Mapping[str, Any]
     ) -> "jb.Simulator | None":
-        """Simulation prepared for numbers within ranges; None where they change its structure.
+        """Simulator for numbers within ranges; None where they change the structure of the case.
 
         That is, where they change the order of parts along the beam, or the duration. It is the
         same for all cases that differ in these numbers only.
@@ -337,7 +337,7 @@ class Workspace:
     def preview(
         self, text: str, values: Mapping[str, float], ranges: Mapping[str, Any] | None = None
     ) -> "jb.Record":
-        """A run with other numbers at some addresses, coarser than `record`, for a moving slider.
+        """Record of a run with other numbers, coarser than `record`, for a moving slider.
 
         Its steps are chosen once for the `ranges` (low, high) of the numbers; beyond them, and
         where the numbers change the structure of the case, they are chosen anew.
@@ -356,11 +356,11 @@ class Workspace:
     # Work that takes long
 
     def start_sweep(self, text: str, axes: Iterable[Mapping[str, Any]]) -> str:
-        """Begin a sweep; returns its number for `job`."""
+        """Job number of a newly started sweep."""
         return self._start_study(studies.Sweep(self.case(text), list(axes)))
 
     def start_fit(self, text: str, names: Iterable[str], free: Mapping[str, Any]) -> str:
-        """Begin a fit of free numbers to logs that were given; returns its number for `job`.
+        """Job number of a newly started fit of free numbers to uploaded logs.
 
         Raises ValueError without a log or without a free number.
         """
@@ -372,7 +372,7 @@ class Workspace:
     def start_modes(
         self, names: Iterable[str], band: Sequence[float] | None, choose: Sequence[float]
     ) -> str:
-        """Begin the search for modes in logs that were given; returns its number for `job`.
+        """Job number of a newly started identification of modes from uploaded logs.
 
         Raises ValueError without a log.
         """
@@ -382,7 +382,7 @@ class Workspace:
         return self._start(jb.api.Job(studies.modes, logs, band, list(choose)))
 
     def start_comparison(self, text: str, names: Iterable[str]) -> str:
-        """Begin a comparison of the controller of a case, if any, with those of other files."""
+        """Job number of a newly started comparison of the controllers of a case and of files."""
         case, found = self.case(text), {}
         if case.controller is not None:
             found["this case"] = case.controller
@@ -391,7 +391,7 @@ class Workspace:
         return self._start(jb.api.Job(studies.compare, case, found))
 
     def start_tuning(self, text: str, free: Mapping[str, Any], vary: str, spread, steps) -> str:
-        """Begin a tuning of numbers of a controller; returns its number for `job`."""
+        """Job number of a newly started tuning of numbers of a controller."""
         parts = self.case(text), dict(free), vary, float(spread), int(steps)
         return self._start_study(studies.PageTuning(*parts))
 
@@ -407,7 +407,7 @@ class Workspace:
         return found
 
     def take_log(self, name: str, content: bytes) -> dict[str, Any]:
-        """Keep a log that was dropped on the page; its columns, units and faults as read.
+        """Columns, units and faults of an uploaded log, which is stored for later fits.
 
         The file of a description that belongs to a log, as run.toml to run.csv, is kept for it.
         Raises ValueError for what is no log.
@@ -421,7 +421,7 @@ class Workspace:
     def read_log(
         self, name: str, columns: str = "", rate: str = "", missing: str = "refuse"
     ) -> dict[str, Any]:
-        """Read a log that was dropped, now with these columns and their units, rate and gaps.
+        """Columns of an uploaded log, read with other columns and units, rate and gaps.
 
         They are as of `tuning.read_logs`, "" for what the file itself tells; later fits read it in
         the same way. Returns what is read, or the `problem` for which it cannot be.
@@ -441,18 +441,18 @@ class Workspace:
         return {"name": name, "logs": logs, "problem": None}
 
     def log(self, name: str) -> list[Any]:
-        """Logs of a file that was dropped on the page. Raises ValueError if there was none."""
+        """Logs of an uploaded file. Raises ValueError if there was none of the name."""
         path = Path(self._uploads.name) / Path(name).name
         if not path.is_file():
             raise ValueError(f"there is no log {name!r}: drop it on the page again")
         return studies.read_logs(path, self._log_options.get(name, {}))
 
     def _start_study(self, study: Any) -> str:
-        """Begin work whose results are seen as it goes on."""
+        """Job number of a newly started study, whose partial results are shown."""
         return self._start(jb.api.Job(study.run), study)
 
     def _start(self, job: "jb.api.Job", study: Any = None) -> str:
-        """Keep work that goes on, of the last few; returns its number."""
+        """Number of a job, which is stored among the last few."""
         number = str(next(self._numbers))
         self._jobs[number] = job, study
         for old in list(self._jobs)[:-KEPT]:
@@ -460,11 +460,11 @@ class Workspace:
         return number
 
     def job(self, number: str, known: int = 0, name: str = "case.toml") -> dict[str, Any]:
-        """State of work: its progress, whether it is done, and its result or what was wrong.
+        """State of a job: its progress, whether it is done, and its result or error.
 
-        `seen` is what a sweep, a fit or a tuning has found so far, beyond the rows or points that
-        are `known`; a case in a file of the `name` is what words to compute it again speak of.
-        Raises ValueError for a number that is not known.
+        `seen` has the results of a sweep, a fit or a tuning so far, without the first `known` rows
+        or points; texts to compute them again name the case file `name`. Raises ValueError for an
+        unknown number.
         """
         job, study = self._known_job(number)
         state: dict[str, Any] = {"done": job.done, "progress": list(job.progress), "problem": None}
@@ -480,7 +480,7 @@ class Workspace:
         return state
 
     def cancel(self, number: str) -> None:
-        """Ask work to end. Raises ValueError for a number that is not known."""
+        """Cancel a job. Raises ValueError for an unknown number."""
         self._known_job(number)[0].cancel()
 
     def _known_job(self, number: str) -> Any:
@@ -489,7 +489,7 @@ class Workspace:
         return self._jobs[number]
 
     def close(self) -> None:
-        """Cancel all work, and forget the logs."""
+        """Cancel all jobs, and remove the logs."""
         for job, _ in self._jobs.values():
             job.cancel()
         self._uploads.cleanup()
@@ -504,5 +504,5 @@ def _mark(text: str) -> str:
 
 
 def _text_of(path: Path) -> str:
-    """Text of a file, with a mark in place of what is none."""
+    """Text of a file, with a replacement character for each byte that is none."""
     return read_input(path, "case file").decode("utf-8-sig", "replace")
