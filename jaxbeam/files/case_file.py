@@ -31,11 +31,11 @@ from jaxbeam.runtime.output_file import whole_file
 
 
 class KindChangeWarning(UserWarning):
-    """A part of a case has another kind, and entries of the former one are left out."""
+    """Warning that the kind of a part was changed, and entries of the former kind are left out."""
 
 
 def change_kind(path: Sequence[str], table: dict[str, Any], kind: Any) -> None:
-    """Remove the entries of a table that another kind has not, or has in another unit.
+    """Remove the entries of a table that its new `kind` lacks, or has in another unit.
 
     A `KindChangeWarning` says what stays. Nothing is changed if one of the kinds is unknown.
     """
@@ -74,7 +74,7 @@ def _family(path: Sequence[str]) -> type | None:
 
 
 def load_case(path: str | os.PathLike) -> Case:
-    """The validated case of a TOML file.
+    """Validated case of a TOML file.
 
     A profile of kind "table" may have its points in a file of their own, `file = "profile.csv"`,
     below the folder of the case file (see `profile_from_file`), and so may vehicles.
@@ -100,7 +100,7 @@ def load_case(path: str | os.PathLike) -> Case:
 
 
 def load_case_with(path: str | os.PathLike, settings: Mapping[str, Any]) -> Case:
-    """The case of a file with other entries at some addresses, validated as it is then.
+    """Validated case of a file with other entries at some addresses.
 
     Raises ValueError as `case_from_tables`, with the file; OSError if the file cannot be read.
     """
@@ -115,7 +115,7 @@ def load_case_with(path: str | os.PathLike, settings: Mapping[str, Any]) -> Case
 
 
 def case_from_tables(content: Mapping[str, Any], folder: Path, settings: Mapping[str, Any]) -> Case:
-    """The validated case of the tables of a case file with other entries at some addresses.
+    """Validated case of the tables of a case file with other entries at some addresses.
 
     Files that the tables name are below the `folder`. `settings` are those of `with_settings`, and
     may name files in the place of those, at profile.file or loads.0.model, which may be anywhere.
@@ -128,7 +128,7 @@ def case_from_tables(content: Mapping[str, Any], folder: Path, settings: Mapping
 
 
 def _from_tables(content: dict[str, Any], folder: Path, named: Mapping[str, Any]) -> Case:
-    """The case of some tables, not validated yet, with `named` files in the place of theirs."""
+    """Case of tables, not validated yet, with `named` files in place of those in the tables."""
     find_vehicle_files(content.get("loads"), folder, named=named)
     return case_from_dict(with_profile_file(content, folder, named.get("profile.file")))
 
@@ -144,7 +144,7 @@ def find_vehicle_files(
     address: str = "loads",
     named: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Paths of vehicle files in tables of loads, relative to a folder, as they are from here.
+    """Join the paths of vehicle files in tables of loads, relative to a folder, with it in place.
 
     Those that the user has `named` by address take their place. Raises as `check_input` for
     another file that is not below the folder.
@@ -164,7 +164,7 @@ def find_vehicle_files(
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:
-    """The controller of a TOML file: a case file, or one with the table [controller] alone.
+    """Controller of a TOML file: a case file, or one with the table [controller] alone.
 
     It is not validated against a case. Raises ValueError, with the file and the address or line,
     for invalid TOML and unknown keys or kinds; OSError if the file cannot be read.
@@ -200,7 +200,7 @@ def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> N
 
 
 def case_from_dict(content: dict[str, Any]) -> Case:
-    """The case that the tables of a case file describe: numbers in SI units, lists and words.
+    """Case that the tables of a case file describe: numbers in SI units, lists and words.
 
     Raises ValueError, with the address, for keys and kinds that are unknown or missing and for
     values of the wrong type or shape. `check_case` validates the values.
@@ -222,7 +222,7 @@ def case_from_dict(content: dict[str, Any]) -> Case:
 
 
 def _read_key(key: str, value: Any) -> Any:
-    """The part, or the tuple of parts, at a key of a case file."""
+    """Part, or tuple of parts, at a key of a case file."""
     part_class, listed = part_classes()[key]
     if not listed:
         if not isinstance(value, dict):
@@ -250,7 +250,7 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
 
 
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:
-    """A validated copy of a case with other entries at some addresses, as in its case file.
+    """Validated copy of a case with other entries at some addresses, as in its case file.
 
     Unlike `case.replace` it also sets words, counts and optional numbers that were left out, those
     of all loads at `loads.*.train`, say; values are concrete (SI units), not traced. Raises
@@ -299,7 +299,7 @@ def _child(node: Any, key: str) -> Any:
 
 
 def _write_part(address: str, part: Any, part_class: type, whole: bool = False) -> dict[str, Any]:
-    """Table of a part; `whole`: with what follows from other entries of it, too."""
+    """Table of a part; if `whole`, with the entries that follow from others, too."""
     table = {}
     implied = () if whole else getattr(part, "implied_fields", tuple)()
     if inspect.isabstract(part_class):

@@ -31,9 +31,9 @@ for (const { title, unit, series } of DATA.panels) {
 
 
 def interactive_page(title: str, sentence: str, columns: Mapping[str, np.ndarray]) -> str:
-    """Page of columns over the first of them, a plot for each quantity with unit.
+    """HTML page of columns over the first of them, a plot for each quantity with unit.
 
-    What a head ends with tells: "midspan deflection (m)" and "sensor 1 deflection (m)" share one.
+    The end of a head is its quantity: "midspan deflection (m)", "sensor 1 deflection (m)".
     """
     (axis, x), *others = columns.items()
     panels: dict[str, dict] = {}
@@ -48,7 +48,7 @@ def interactive_page(title: str, sentence: str, columns: Mapping[str, np.ndarray
 
 
 def page_of(title: str, sentence: str, scripts: Sequence[str], data: Mapping, show: str) -> str:
-    """Page of data (DATA) that a text of JavaScript shows by scripts of the page in the browser."""
+    """HTML page of data (DATA), shown by the JavaScript `show` and by scripts of `jaxbeam app`."""
     folder = resources.files("jaxbeam") / "app" / "static"
     texts = [(folder / name).read_text(encoding="utf-8") for name in scripts]
     modules = re.sub(r"^import .*$|^export ", "", "\n".join(texts), flags=re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Keys of case files by their declarations, and their JSON Schema."""
+"""Keys of case files, from the declarations of fields, and their JSON Schema."""
 
 import dataclasses
 import inspect
@@ -47,7 +47,7 @@ class Key(NamedTuple):
 
     @property
     def values(self) -> str:
-        """Phrase for the values that it takes."""
+        """Phrase that describes the values of the key."""
         metadata = self.field.metadata
         if self.is_number:
             return describe_shape(self.field)
@@ -59,7 +59,7 @@ class Key(NamedTuple):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Words that it takes; () for any."""
+        """Words that the key allows; () for any."""
         return tuple(word for word in self.field.metadata.get("allowed", ()) if word)
 
 

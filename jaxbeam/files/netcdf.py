@@ -16,7 +16,7 @@ OTHER_FORMATS = (".zarray", ".zgroup", ".zattrs", ".zmetadata")  # files of zarr
 
 
 def check_codecs(path: Path) -> None:
-    """Check, before anything is decoded, that a store has no codecs but those of jaxbeam.
+    """Check, before anything is decoded, that a store has only codecs that jaxbeam writes.
 
     Others, of format 2 above all, may run code of the store. Raises ValueError for one, and for
     metadata that cannot be read; OSError for a part that is no regular file.

@@ -43,7 +43,7 @@ def as_text_cell(text: str) -> str:
 
 
 def from_text_cell(cell: str) -> str:
-    """The text of which `as_text_cell` made a cell.
+    """Original text of a cell that `as_text_cell` returned.
 
     >>> from_text_cell("'=1+1"), from_text_cell("'t Zand")
     ('=1+1', "'t Zand")

@@ -1,4 +1,4 @@
-"""Export of the controller of a case: design of gains and estimator, tabulated."""
+"""Gains and estimator of the controller of a case, designed and tabulated for export."""
 
 from typing import NamedTuple
 
@@ -100,9 +100,9 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
 
 
 def _further_columns(case: Case) -> tuple:
-    """Names and units of what a regulator over the crossing feeds back or forward too, in turn.
+    """Names and units of the further columns of z of a regulator over the crossing, in order.
 
-    States of vehicles, weights of the wheels, and 1 for other known disturbances.
+    They are states of vehicles, weights of the wheels, and 1 for other measured disturbances.
     """
     loads = load_set(case)
     weights = tuple((f"load_{i}", "N") for i in range(loads.wheel_count))
@@ -121,7 +121,7 @@ def _digital_filters(case: Case) -> np.ndarray:
 
 
 class GainDesign(NamedTuple):
-    """Numbers of a gain table as they are designed; see `Gains`."""
+    """Designed numbers of a gain table; see `Gains`."""
 
     system: StateSpace
     masses: Float[Array, " mass"]
@@ -134,7 +134,7 @@ class GainDesign(NamedTuple):
 
 @compiled
 def _design_gains(case: Case, layout, shares) -> GainDesign:
-    """Design of the controller of a case, tabulated at shares of the crossing."""
+    """Design of the controller of a case, tabulated at fractions (`shares`) of the crossing."""
     controller = case.controller
     plant = state_space(case, layout=layout).of_driven()
     design_plant = controller.design_plant(plant)
@@ -159,7 +159,7 @@ def _estimator_matrix(filter: ConstantGainFilter) -> Float[Array, "row entry"]:
 def _tabulated(
     law: AbstractStateLaw, shares: Float[Array, " share"]
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Masses (kg), speeds (m/s), gains at the shares and after the crossing, crossing time (s)."""
+    """Masses (kg), speeds (m/s), gains at fractions of and after the crossing, its time (s)."""
     no_grid = jnp.zeros(1), jnp.zeros(1)
     if isinstance(law, GainLaw):
         return *no_grid, law.gain[None, None, None], law.gain[None, None], jnp.zeros(())

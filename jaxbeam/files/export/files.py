@@ -1,4 +1,4 @@
-"""Files of gains, in the format of their suffix; reading one returns the same numbers.
+"""Files of gains in the format of their suffix, written and read back without loss.
 
 Each file holds the sampling period, the units and the check values: the CRC-32 of all numbers as
 little-endian doubles, and commands and estimate for a stated input.

@@ -17,7 +17,7 @@ class Gains:
     """Gain tables as a controller evaluates them: u = -K(mass, speed, share) z.
 
     `table` (mass, speed, share, actuator, column) is K at the `masses` (kg), `speeds` (m/s) and
-    `shares` of the crossing, from 0 at the entry of the first load to 1 at the exit of the last;
+    fractions (`shares`) of the crossing, 0 at the entry of the first load, 1 at the last exit;
     `rest` (mass, speed, actuator, column) is K after the exit, which decays with the time constant
     `decay_time` (s) if that is finite. K is interpolated linearly over the share, and over mass and
     speed either linearly too (`interpolation` "interpolated") or by the "nearest" design; beyond
@@ -57,12 +57,12 @@ class Gains:
         mass: float = 0.0,
         speed: float = 0.0,
     ) -> np.ndarray:
-        """Commands for a state z, in the order of `columns`, at a share of the crossing.
+        """Commands for a state z, in the order of `columns`, at a fraction of the crossing.
 
-        The share is negative before the entry, where commands are zero, and 1 or more from the exit
-        on, which was `since_exit` s ago. `mass` (kg) and `speed` (m/s, absolute) are those of the
-        load. Products are added in the order of the function `jaxbeam_command` of the C header, so
-        results agree to the last bit (with a finite `decay_time`, if both use the same `exp`).
+        The `share` is negative before the entry, where commands are zero, and 1 or more from the
+        exit on, which was `since_exit` s ago. `mass` (kg) and `speed` (m/s, absolute) are those of
+        the load. Products are added in the order of the function `jaxbeam_command` of the C header,
+        so results agree to the last bit (with a finite `decay_time`, if both use the same `exp`).
         """
         total = np.zeros(len(self.commands))
         if share < 0:
