@@ -1,4 +1,4 @@
-"""Controllers on one case: deflections and commands, beside the least achievable peak."""
+"""Figure of controllers on one case: deflections, commands, and the least achievable peak."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ OPTIMAL_STYLE = {"color": INK, "linewidth": 1.0, "linestyle": (0, (5, 2))}
 def plot_comparison(
     comparison: Comparison, *, ax: Axes | None = None, title: str | None = None
 ) -> Figure | SubFigure:
-    """Deflection at the sensor with the largest uncontrolled peak, and commands, of controllers.
+    """Figure of controllers: commands, and deflection at the sensor of the largest peak.
 
     Dashed: the optimal commands of the bound and their response; thin line: the least achievable
     peak. Labels give peaks and, in brackets, shares of the attainable reduction. The figure takes

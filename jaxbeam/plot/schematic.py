@@ -8,7 +8,7 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
-from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels, text_share
+from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels, text_fraction
 from jaxbeam.plot.traffic.drawing import vehicle_art
 
 # Markers in points, below the point of the beam they support.
@@ -103,7 +103,7 @@ def draw_schematic(axes, case: Case) -> None:
     texts = {
         f"{x:.4g} m": (i, x) for i, x in enumerate(sensor_positions)
     }  # of sensors at one place
-    gap = 1.04 * length * text_share(axes, max(map(len, texts), default=0) + 2)
+    gap = 1.04 * length * text_fraction(axes, max(map(len, texts), default=0) + 2)
     # Of more sensors than there is room for labels every second or third has one.
     labelled = list(texts.items())[:: 1 + int(gap * len(texts) / length)]
     supports = [0.0, length, *(float(concrete(one.position)) for one in case.supports)]

@@ -58,7 +58,7 @@ STYLE = {
 
 
 def use_style(draw: F) -> F:
-    """Decorator of functions that draw: with the style of all figures, of known numbers."""
+    """Function that draws in the style of all figures, and refuses traced numbers."""
     return rc_context(STYLE)(refuses_traced("a figure")(draw))
 
 
@@ -115,7 +115,7 @@ def label_height(axes: Axes, words: str, unit: str) -> None:
 
 
 def drawing_area(ax: Axes | None, size: Size) -> Figure | SubFigure:
-    """A figure of some size (inches), or a part of the figure of `ax` that takes its place.
+    """New figure of some size (inches), or the subfigure that takes the place of `ax`.
 
     Raises ValueError if the axes have no place in a grid.
     """
@@ -163,8 +163,8 @@ def set_title(
         figure.suptitle(title, x=0.01, ha="left")
 
 
-def text_share(axes: Axes, characters: int, size: float = 9.0) -> float:
-    """Width of a text of a font size (points) over that of the axes, about."""
+def text_fraction(axes: Axes, characters: int, size: float = 9.0) -> float:
+    """Approximate width of a text of a font size (points), as a fraction of the axes."""
     figure = axes.get_figure(root=True)
     width = 72 * axes.get_window_extent().width / (figure.dpi if figure else 72)
     return 0.55 * size * characters / width

@@ -43,7 +43,7 @@ from jaxbeam.plot.style import (
     use_style,
 )
 
-LABEL_MARGIN = 0.06  # share of a map at its edges where contour labels would be cut off
+LABEL_MARGIN = 0.06  # fraction of a map at its edges where contour labels would be cut off
 QUANTILE = "quantile"  # xarray's name of the dimension of fractiles
 MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with dots
 
@@ -137,7 +137,7 @@ def _fractiles_as_sensors(peaks: xarray.DataArray) -> xarray.DataArray:
 
 
 def _fixed_value(case: Case, address: str, value) -> str:
-    """What a dimension is that was selected, and its value."""
+    """Name and value of a dimension that was selected."""
     if address == QUANTILE:
         return _fractile_words(value)
     words = address_words(case, address)
@@ -231,7 +231,7 @@ def _curves(groups: list[QuantityPeaks], swept, case, ax):
 
 
 def _bars(groups: list[QuantityPeaks], swept, case, ax):
-    """Peaks of words, a bar for each sensor beside each word."""
+    """Draw peaks over words, with a bar for each sensor at each word."""
     (address,) = swept
     labels = [str(word) for word in groups[0].peaks[address].values]
     heights = [0.9 + 0.3 * len(labels) * len(group.names) for group in groups]

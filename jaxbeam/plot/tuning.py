@@ -1,4 +1,4 @@
-"""Figures of tunings: their course, and fronts of several aims."""
+"""Figures of tunings: objective over the steps, and Pareto fronts."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

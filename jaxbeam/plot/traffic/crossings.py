@@ -16,7 +16,7 @@ from jaxbeam.plot.style import (
     label_height,
     load_colour,
     margin_labels,
-    text_share,
+    text_fraction,
     tinted,
     unit_scale,
 )
@@ -25,7 +25,7 @@ from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 
 MAX_CURVES = 5  # wheels or bodies of a load with a curve each; those of more are an envelope
-SAME_FORCE = 1e-6  # share of the static load by which a contact force may differ from it
+SAME_FORCE = 1e-6  # of the static load, by which a contact force may differ from it
 MAX_WEIGHTS = 4  # static loads with a line and a label each
 
 
@@ -78,23 +78,26 @@ def draw_forces(axes, record: Record) -> None:
 
 
 def _draw_envelope(axes, times, force, static, wheels, tint):
-    """Draw the range of the forces of many wheels; the one with the least share, if they vary."""
+    """Draw the range of the forces of many wheels, and the force of the one most unloaded.
+
+    Returns that wheel; None, without its curve, if the forces do not vary.
+    """
     some = np.isfinite(force[:, wheels]).any(axis=1)
     low, high = np.full(times.shape, np.nan), np.full(times.shape, np.nan)
     low[some] = np.nanmin(force[some][:, wheels], axis=1)
     high[some] = np.nanmax(force[some][:, wheels], axis=1)
     axes.fill_between(times, low, high, color=tinted(tint, 0.3), linewidth=0)
     seen = wheels[np.isfinite(force[:, wheels]).any(axis=0) & (static[wheels] > 0)]
-    shares = np.nanmin(force[:, seen], axis=0) / static[seen] if seen.size else np.ones(1)
-    if np.min(shares) > 1 - 1e-6:
+    ratios = np.nanmin(force[:, seen], axis=0) / static[seen] if seen.size else np.ones(1)
+    if np.min(ratios) > 1 - 1e-6:
         return None
-    worst = int(seen[np.argmin(shares)])
+    worst = int(seen[np.argmin(ratios)])
     axes.plot(times, force[:, worst], color=tint, linewidth=1.1)
     return worst
 
 
 def _main_values(values) -> list[float]:
-    """Different values, to three digits; the least and the largest of too many."""
+    """Distinct values to three digits; of more than MAX_WEIGHTS the least and the largest."""
     different = sorted({float(f"{value:.3g}") for value in values})
     return different if len(different) <= MAX_WEIGHTS else [different[0], different[-1]]
 
@@ -166,7 +169,7 @@ def draw_accelerations(axes, record: Record) -> None:
 
 
 def draw_strokes(axes, record: Record) -> None:
-    """Strokes of the absorbers, the largest of each beside it, dashed lines at what they may."""
+    """Strokes of the absorbers, each with its largest value; dashed lines at their limits."""
     times, strokes, absorbers = record.times, np.asarray(record.stroke), record.case.absorbers
     factor, unit = unit_scale(strokes, "m")
     axes.axhline(0, color=GREY, linewidth=0.8)
@@ -218,7 +221,7 @@ def label_loads(axes, record: Record) -> None:
     left, right = axes.get_xlim()
 
     def width(characters: int) -> float:
-        return (right - left) * text_share(axes, characters + 1, FONT_SIZE)
+        return (right - left) * text_fraction(axes, characters + 1, FONT_SIZE)
 
     groups = _groups(windows, width(len(f"load {len(loads)}")))
     if len(groups) < len(windows):

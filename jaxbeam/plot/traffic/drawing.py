@@ -50,7 +50,7 @@ class DrawnVehicle(NamedTuple):
 
 
 def drawn_vehicle(load: AbstractLoad | Absorber, gravity=9.81) -> DrawnVehicle:
-    """What to draw of one vehicle of a load; parts that carry nothing else are found by springs."""
+    """Parts, wheels and springs to draw of one vehicle of a load, described or by matrices."""
     model = load.vehicle(np.float64(gravity))
     if isinstance(load, VehicleLoad):
         names, positions, springs = _described(load)
@@ -90,7 +90,7 @@ def _level(part: int, springs, depth: int = 0) -> int:
 
 
 def _hinges(load: AbstractLoad, names: list[str]) -> list[tuple[tuple[int, int], float]]:
-    """Pairs of hinged parts, and where (m)."""
+    """Pairs of hinged parts, and positions (m) of the hinges."""
     if not isinstance(load, VehicleLoad):
         return []
     origin = float(concrete(load.axles[0].position))

@@ -42,14 +42,14 @@ class Traffic:
         self._profile = surface_height(record.case, self._wide) / factor
 
     def _deflection(self, frame, positions):
-        """Deflection at positions in units of the axis, zero beside the beam."""
+        """Deflection at positions in units of the axis, zero off the beam."""
         return np.interp(positions, self._x, self._beam[frame], left=0.0, right=0.0)
 
     def _make_room(self, art, scale: float) -> float:
         """Draw springs as long as needed; returns their change of length in units of the axis."""
         frames = range(self._positions.shape[0])
         under = scale * surface_height(self._record.case, self._positions) / self._factor
-        # Bodies follow the beam by the share that is not in their motion.
+        # Bodies follow the beam by the fraction that is not in their motion.
         under += scale * np.stack([self._deflection(i, self._positions[i]) for i in frames])
         motion, first, room = scale * self._motion(), 0, 0.0
         for one in art:
@@ -64,16 +64,16 @@ class Traffic:
     def draw(self, axes) -> Callable[[int], None]:
         """Set the limits of the axes and draw the loads; returns a function that moves them.
 
-        On a profile of more than a share of the deflections, heights r of the profile and u of the
-        bodies are drawn k times as large: the surface at w + k r, bodies at k u + (1 - k) w.
+        If the profile is rough beside the deflections, heights r of the profile and u of the bodies
+        are drawn k times as large: the surface at w + k r, bodies at k u + (1 - k) w.
         """
         case, loads = self._record.case, self._loads
         low, high = min(np.min(self._beam), 0.0), max(np.max(self._beam), 0.0)
         height_range = (high - low) or 1.0
-        bottom, top, share = low - 0.15 * height_range, high, 0.4 / 1.55
+        bottom, top, margin = low - 0.15 * height_range, high, 0.4 / 1.55
         if loads.on_ground.any():
             tallest = max(one.height for one in vehicle_art(axes, case, WHEEL_SIZE, 1.0))
-            share = min(0.7, (tallest * WHEEL_SIZE + 14.0) / AXES_HEIGHT)
+            margin = min(0.7, (tallest * WHEEL_SIZE + 14.0) / AXES_HEIGHT)
         rough = np.max(np.abs(self._profile))
         scale = min(1.0, PROFILE_SHARE * height_range / rough) if rough > 0 else 1.0
         motion, profile = scale * self._motion(), scale * self._profile
@@ -81,7 +81,7 @@ class Traffic:
         top += max(0.0, np.max(profile), np.max(self._heights(motion), initial=0.0) - high)
         # Twice: wheels, of a size in points, are higher in units of a longer axis.
         room = self._make_room(vehicle_art(axes, case, WHEEL_SIZE, 0.0), scale)
-        top += room + (top + room - bottom) * share / (1 - share)
+        top += room + (top + room - bottom) * margin / (1 - margin)
         art = vehicle_art(axes, case, WHEEL_SIZE, WHEEL_SIZE / AXES_HEIGHT * (top - bottom))
         self._make_room(art, scale)
         axes.set(xlim=self._xlim, ylim=(bottom, top))
@@ -121,7 +121,7 @@ class Traffic:
         return update
 
     def _heights(self, motion):
-        """Motions of the degrees of freedom that are heights."""
+        """Motions of the degrees of freedom that are heights, without rotations."""
         return motion[:, [not name.endswith(" pitch") for name in self._record.bodies]]
 
 
