@@ -302,23 +302,23 @@ def parse_size(text: str) -> tuple[float, float]:
 
 
 def check_exists(kind: str, *paths: Path) -> None:
-    """Raises FileNotFoundError if one of the files, of a kind such as "log file", is missing."""
+    """Check that files of a kind, as "log file", exist. Raises FileNotFoundError otherwise."""
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
 def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
-    """Whether a file can be written by its suffix, before any work.
+    """Check, before any work, that a file can be written by its suffix.
 
-    Raises UsageError if it has not the suffix of its content, nor one of the others, ImportError if
-    the package that writes it is not installed.
+    Raises UsageError for another suffix than that of its content or one of the others, ImportError
+    if the package that writes it is not installed.
     """
     if path:
         check_ending(path, content, (suffix, *others))
 
 
 def refuse_option(is_given: bool, reason: str) -> None:
-    """Raises UsageError with the reason if an option is given that does not apply."""
+    """Check that an option that does not apply is absent. Raises UsageError with the reason."""
     if is_given:
         raise UsageError(reason)

@@ -34,14 +34,14 @@ def benchmark(
     seed
         Seeds of test loads other than the published ones.
     """
-    known = sorted(
+    problems = sorted(
         file.name.removesuffix(".toml")
         for file in (resources.files("jaxbeam.benchmark") / "problems").iterdir()
         if file.name.endswith(".toml")
     )
-    if problem and problem not in known:
+    if problem and problem not in problems:
         raise UsageError(
-            f"there is no problem {problem!r} in the benchmark; it has {', '.join(known)}"
+            f"there is no problem {problem!r} in the benchmark; it has {', '.join(problems)}"
         )
     needs_problem = bool((controller or seed) and not problem)
     refuse_option(needs_problem, "--controller and --seed are for one problem: name it")

@@ -1,4 +1,4 @@
-"""Command `compare`: controllers on a case, beside the least achievable peak."""
+"""Command `compare`: controllers on a case, and the least achievable peak."""
 
 import itertools
 import math
@@ -30,7 +30,7 @@ def compare(
     pictures: DrawingOptions = DrawingOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Compare controllers on a case, beside the least peak that any controller can achieve.
+    """Compare controllers on a case with each other, and with the least achievable peak.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ def describe(
 
 
 def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
-    """What a case is, in numbers by their names in JSON and in words."""
+    """Description of a case: numbers by their names in JSON, and lines of text."""
     import jaxbeam as jb
     from jaxbeam.case.display import with_prefix
 
@@ -101,7 +101,7 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
 
 
 def _beam_words(case: "Case") -> str:
-    """Length, ends, supports, stiffness, mass and damping of the beam of a case."""
+    """Sentence on length, ends, supports, stiffness and mass of the beam of a case."""
     from jaxbeam.case.display import with_prefix
 
     beam, count = case.beam, len(case.supports)
@@ -114,7 +114,7 @@ def _beam_words(case: "Case") -> str:
 
 
 def settlement_words(case: "Case") -> list[str]:
-    """What settles, and the smallest and largest moment that this locks in."""
+    """Line on settled supports, and the smallest and largest moment by them; none without."""
     import numpy as np
 
     from jaxbeam.case.display import with_prefix
@@ -138,13 +138,13 @@ def settlement_words(case: "Case") -> list[str]:
 
 
 def _speed(value: float) -> str:
-    """A speed in m/s, and of those that a vehicle may have on a road or a line in km/h too."""
+    """Text of a speed in m/s, from FAST on also in km/h."""
     text = f"{value:.4g} m/s"
     return f"{text} ({3.6 * value:.4g} km/h)" if abs(value) >= FAST else text
 
 
 def _load_times(case: "Case") -> list[str]:
-    """When each load is on the beam, and how fast it enters; of more than a few loads the first."""
+    """Lines on speed, entry and exit time of the first loads, and on the duration of the run."""
     from jaxbeam.case.case import crossing_times
     from jaxbeam.case.trajectory import NEVER
 
@@ -237,7 +237,7 @@ def _result(
 
 
 def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
-    """A vehicle in words; of a part of a case the first and the last of many wheels."""
+    """Lines on a vehicle; of a part of a case the first and the last of many wheels."""
     lines = [result["title"]]
     if result["source"]:
         lines.append(f"source: {result['source']}")

@@ -12,7 +12,7 @@ from jaxbeam.cli.arguments import check_suffix, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
 from jaxbeam.files.endings import TABLES
 
-ZERO = 1e-5  # share of the largest value of a quantity that is printed as 0
+ZERO = 1e-5  # fraction of the largest value of a quantity that is printed as 0
 
 
 def assess(

@@ -209,7 +209,7 @@ def modes_from_log(
 
 
 def _picture(log: Path, word: str) -> Path:
-    """File of a picture named after a log, in this folder, told from others by a word."""
+    """Path of a picture in this folder, named after a log and a word."""
     return figure_path(None, log.with_stem(f"{log.stem}{word}"))
 
 
@@ -231,9 +231,9 @@ def _window(log: "Log", from_: float | None, to: float | None):
 
 
 def _of_setup(names: list[str] | None, setup: "list[Log]", read: "list[Log]"):
-    """Those of some channels that the logs of a setup have.
+    """Names, among those of some channels, that the logs of a setup have.
 
-    All, for one clear error, if no log has one of them, or this setup has none.
+    All names, for one clear error, if no log has one of them, or this setup has none.
     """
     if names is None or any(all(name not in log.names for log in read) for name in names):
         return names

@@ -35,8 +35,7 @@ def monitor(
     Each log is analysed once, also after an interruption: its modes are kept in a file, and only
     new logs are analysed by the next call. Modes are followed by frequency and shape; of the first
     logs (the baseline) frequencies are regressed on temperatures and other conditions, and a
-    control chart of what these do not explain has the alarms. Raises FileNotFoundError without the
-    folder.
+    control chart of the residuals raises the alarms. Raises FileNotFoundError without the folder.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ def _absorber_lines(record: "jb.Record") -> list[str]:
 
 
 def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
-    """Of many wheels, those at which one of the values is largest, named by what is extreme."""
+    """Labels of the wheels at which one of the values is largest, with the names of these."""
     import numpy as np
 
     wheels, words = np.array(list(labels)), {"unloading": "most unloaded"}
@@ -148,11 +148,11 @@ def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
     }
 
 
-def _percent(share: float, prescribed: bool) -> str:
-    """Unloading of a wheel; a prescribed force that pulls does so because it was given so."""
-    if share > 1:
+def _percent(unloading: float, prescribed: bool) -> str:
+    """Unloading of a wheel in per cent, or that it would lift; a prescribed force may pull."""
+    if unloading > 1:
         return "pulls, as given" if prescribed else "would lift"
-    return "-" if share != share else f"{max(share, 0.0):.1%}"
+    return "-" if unloading != unloading else f"{max(unloading, 0.0):.1%}"
 
 
 def _body_lines(record: "jb.Record") -> list[str]:

@@ -70,8 +70,8 @@ def sweep(
         QUANTITY=VALUE, as "acceleration=3.5 m/s^2": count the runs above it, and draw it; repeat
         it for more.
     run_up
-        Begin so far before the bridge that vehicles have forgotten their start on a rough track: at
-        the fastest of the speeds, 1 % of their free motion is left at the bridge.
+        Start vehicles so far before the bridge that their initial transient on a rough track has
+        decayed: at the fastest of the speeds, 1 % of it is left at the bridge.
     resume
         Continue an interrupted sweep in the same store.
     scheduler
@@ -149,7 +149,7 @@ def sweep(
 
 
 def _with_run_up(case: "jb.Case", values: dict) -> "jb.Case":
-    """The case with its vehicles far enough before the bridge for all swept speeds."""
+    """Case whose vehicles start far enough before the bridge for all swept speeds."""
     from jaxbeam.analysis.run_up import with_run_up
     from jaxbeam.case.reading.units import number_in_si
 
@@ -180,7 +180,7 @@ def _limits(case: "jb.Case", given: Sequence[str]) -> dict[str, float]:
 
 
 def _limit_lines(results: "xarray.Dataset", limits: dict[str, float]) -> list[str]:
-    """How many runs are above each limit."""
+    """Lines with the number of runs above each limit."""
     lines = []
     for quantity, limit in limits.items():
         peaks, unit = results[f"peak_{quantity}"], results[f"peak_{quantity}"].attrs["units"]
@@ -303,7 +303,7 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
 
 
 def _truncation_lines(results: "xarray.Dataset") -> list[str]:
-    """Sentence on what the modes left out change of the peaks of each quantity, where known."""
+    """Sentence on the truncation errors of the peaks of each quantity, where estimated."""
     errors = [
         f"{name.removeprefix('peak_')} {peaks.attrs['truncation_error']:.1e}"
         for name, peaks in ((str(name), results[name]) for name in results)
@@ -313,7 +313,7 @@ def _truncation_lines(results: "xarray.Dataset") -> list[str]:
 
 
 def _head(values: "xarray.DataArray") -> str:
-    """What a swept dimension is, with its unit."""
+    """Name of a swept dimension, with its unit."""
     unit = values.attrs.get("units", "1")
     words = values.attrs.get("long_name", str(values.name))
     return words if unit == "1" else f"{words} ({unit})"

@@ -87,7 +87,7 @@ def tune(
     extra_delay
         With --max-real-part: delay (s), beyond that of the controller, with which it holds too.
     parameter_tolerance
-        With --max-real-part: ADDRESS=SHARE, relative error of a parameter with which it holds too,
+        With --max-real-part: ADDRESS=ERROR, relative error of a parameter with which it holds too,
         such as beam.flexural_rigidity=0.1; repeat it for more.
     method
         adam, lbfgs (optax) or bfgs (optimistix). If left out, lbfgs with --pareto and

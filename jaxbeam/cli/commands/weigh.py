@@ -35,7 +35,7 @@ def weigh(
     reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Identify the loads that crossed a known beam: their number, masses, speeds, entry times.
+    """Identify the loads that crossed the beam of a case: number, masses, speeds, entry times.
 
     Parameters
     ----------
