@@ -116,7 +116,7 @@ def with_initial_controller(case: jb.Case) -> jb.Case:
 
 
 def _worst_run_text(results: xarray.Dataset) -> str:
-    """The largest deflection of the sweep, and the share of runs with lost contact."""
+    """Sentence on the largest deflection of the sweep, and the runs that lose contact."""
     peaks = results.peak_deflection
     worst = peaks.isel(peaks.argmax(list(peaks.dims)))
     lost_contact_share = results.contact_lost_time.notnull().any("load").mean()

@@ -56,7 +56,7 @@ CASES["semi-active"] = DAMPED
 
 
 class CodeFigures(NamedTuple):
-    """What the C of a law costs, and the largest errors of its commands over the largest one."""
+    """Cost of the C of a law, and the largest errors of its commands over the largest one."""
 
     operations: int
     state_bytes: int

@@ -79,7 +79,7 @@ def operation_stages(dump: Path, module: str) -> dict[str, str]:
 
 
 def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, float]:
-    """Share of each stage in the time of all kernels of a module, largest first."""
+    """Fraction of each stage in the time of all kernels of a module, largest first."""
     (path,) = trace.rglob("*.trace.json.gz")
     with gzip.open(path) as file:
         events = json.load(file)["traceEvents"]
@@ -102,7 +102,7 @@ def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, 
 
 
 def measure(modes: int, folder: Path) -> dict[str, float]:
-    """Share of each stage in the time of a sweep, largest first; its trace is kept in a folder."""
+    """Fraction of each stage in the time of a sweep, largest first; the trace stays in a folder."""
     flags = f"--xla_dump_to={folder / 'hlo'} --xla_dump_hlo_as_text"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     jax.config.update("jax_enable_compilation_cache", False)  # cached programs are not dumped

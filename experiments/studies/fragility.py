@@ -115,9 +115,9 @@ def _with_second_mass(case: jb.Case) -> jb.Case:
 
 
 def with_gate_error(case: jb.Case, error: float) -> jb.Case:
-    """The case with a first gate that is off by a share of the distance between both.
+    """Case with a first gate that is misplaced by a fraction of the distance between both.
 
-    The law takes the load for faster by that share, and its position for
+    The law takes the load for faster by that fraction, and its position for
     x_2 + (x - x_2) (1 + error), x_2 the second gate: as if its table was stretched about that gate.
     """
     law, length = case.controller, float(case.beam.length)

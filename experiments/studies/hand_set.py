@@ -1,4 +1,4 @@
-"""Laws drawn by hand on the patch rigs: the yardstick beside which tuned laws are judged.
+"""Laws drawn by hand on the patch rigs, the reference for tuned laws.
 
 A trapezium of four numbers on the same gates as the tuned table, and a table over the deflection
 that goes to the limits where the tuning of the sensors-only law starts to be flat. No number of

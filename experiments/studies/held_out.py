@@ -77,7 +77,7 @@ RIGIDITY_ERRORS = {"10 % stiffer": 1.1, "10 % softer": 0.9}  # of the plant over
 class HeldOutStudy:
     """Reductions of the peak for the held-out loads of a rig, achievable and by law.
 
-    Reductions are shares of the peak without control, (run,). `records` has the record of the last
+    Reductions are fractions of the peak without control, (run,). `records` has that of the last
     run of each law.
     """
 

@@ -41,7 +41,7 @@ def three_mass_case(load_rig) -> jb.Case:
 
 
 def regulator(entry_time_error: float = 0.0, mass_error: float = 0.0) -> AbstractController:
-    """The regulator designed for entries that are later (s) and masses that are heavier (share)."""
+    """Regulator designed for entries that are later (s), masses that are heavier (a fraction)."""
     design_model = DesignModel(
         mass=[MASS * (1 + mass_error)] * 3, entry_time=ENTRY_TIMES + entry_time_error
     )

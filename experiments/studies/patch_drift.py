@@ -1,4 +1,4 @@
-"""Hysteresis and creep of a patch, and what the inverses that a log identifies leave of them.
+"""Hysteresis and creep of a patch, and the errors left by inverses identified from a log.
 
 The thesis sees the deflection lag behind a falling voltage (Fig. 2.33). Here the patch of rig B has
 a hysteresis and a creep of 2 % a decade; both are identified from a log of commands that turn and
@@ -142,8 +142,8 @@ INTERVAL, NOISE = 0.1, 2e-7  # s; m
 PERIOD = 0.05
 
 
-class Left(NamedTuple):
-    """Largest error of what acts, of a wanted course of commands, over its largest command."""
+class RemainingErrors(NamedTuple):
+    """Largest errors of the effective command, over the largest desired command, by inverse."""
 
     straight: float
     without_creep: float
@@ -157,14 +157,14 @@ def log_of_patch(seed: int = 1) -> tuning.Log:
     operator = command_operator(HYSTERESIS, CREEP, np.asarray(INTERVAL))
     patch = dataclasses.replace(rigs.load("B"), loads=(), controller=None)
     gain = float(static_deflection_per_command(patch, 0.3)[0])
-    readings = gain * _acting(operator, commands)
+    readings = gain * _effective(operator, commands)
     readings += NOISE * np.random.default_rng(seed).normal(size=times.size)
     values = np.stack([commands, readings], axis=1)
     return tuning.Log(times, values, ("u", "w"), ("voltage", "deflection"), ("V", "m"))
 
 
-def what_is_left(found: CreepFit) -> Left:
-    """Errors of what acts where four smooth pulses, and then 4 V for 20 s, are wanted."""
+def remaining_errors(found: CreepFit) -> RemainingErrors:
+    """Errors of the effective command for four smooth pulses, and then 4 V for 20 s."""
     times = np.arange(0.0, 30.0, PERIOD)
     wanted = np.where(times < 10.0, 3 * (1 - np.cos(2 * np.pi * times / 2.5)), 4.0)
     true = command_operator(HYSTERESIS, CREEP, np.asarray(PERIOD))
@@ -172,13 +172,13 @@ def what_is_left(found: CreepFit) -> Left:
     errors = []
     for creep in (None, found.creep):
         fitted = command_operator(found.hysteresis, creep, np.asarray(PERIOD))
-        errors.append(_acting(true, _acting(fitted.inverse(), wanted)) / scale - wanted)
-    straight = _acting(true, wanted) / scale - wanted
-    return Left(*(float(np.max(np.abs(e)) / wanted.max()) for e in (straight, *errors)))
+        errors.append(_effective(true, _effective(fitted.inverse(), wanted)) / scale - wanted)
+    straight = _effective(true, wanted) / scale - wanted
+    return RemainingErrors(*(float(np.max(np.abs(e)) / wanted.max()) for e in (straight, *errors)))
 
 
-def _acting(operator, commands) -> np.ndarray:
-    """What acts for commands in turn, from rest."""
+def _effective(operator, commands) -> np.ndarray:
+    """Output of a hysteresis and creep operator for successive commands, from rest."""
     state, found = operator.start(1), []
     for command in commands:
         state = operator.follow(state, np.full(1, command))
@@ -187,15 +187,15 @@ def _acting(operator, commands) -> np.ndarray:
 
 
 def table() -> str:
-    """What is left of hysteresis and creep, in per cent of the largest command."""
+    """Text of the errors by hysteresis and creep, in per cent of the largest command."""
     found = fitted_creep(log_of_patch(), "u", "w")
-    left = what_is_left(found)
+    left = remaining_errors(found)
     return "\n".join(
         [
             f"identified with rates {found.creep.rates.round(3)} 1/s, weights"
             f" {found.creep.weights.round(4)}; residual {1e6 * found.residual:.2f} um of"
             f" {1e6 * found.linear_residual:.2f} um by a line",
-            "largest error of what acts, of the largest command:",
+            "largest error of the effective command, over the largest command:",
             f"  commands as they are            {left.straight:6.1%}",
             f"  inverse of the hysteresis       {left.without_creep:6.1%}",
             f"  inverse of hysteresis and creep {left.compensated:6.1%}",

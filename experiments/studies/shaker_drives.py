@@ -1,4 +1,4 @@
-"""Shaker of rig A driven by voltage, current or force: what a loop of its own would have changed.
+"""Shaker of rig A driven by voltage, current or force: the effect of an inner loop.
 
 The thesis finds that the force of the shaker follows the voltage up to some 10 Hz only, and that a
 feedback of its own might give a precise force above (section 2.2.2). Here the shaker of Table 2.3

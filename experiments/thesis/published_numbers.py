@@ -4,7 +4,7 @@ Tolerances by the kind of published number, and the unit of frequency.
 
 Computed numbers: a unit of the last printed digit, and the rounding of the printed parameters where
 the number follows from them. Measured numbers: twice the standard deviation of the sensors, which
-section 5.1 prints beside no peak; the scatter of a table would be a judge in its own case.
+section 5.1 prints beside no peak; the scatter of a table is no independent measure of its errors.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ SHORT_WHOLE_NUMBER = 3  # digits up to which zeros at the end of a whole number 
 class Tolerance:
     """Allowed difference from a published number: the largest of three bounds.
 
-    `relative` is a share of the number, `absolute` is in its unit, for all numbers or for each,
+    `relative` is a fraction of the number, `absolute` in its unit, for all numbers or for each,
     `digits` counts units of its last printed digit (zeros at the end of a whole number of four or
     more digits are not digits). `basis` names what the tolerance rests on.
     """
@@ -121,8 +121,8 @@ def of_two_peaks(*peaks: float, runs: int = 1) -> Tolerance:
 
     Peaks are means over `runs` runs.
     """
-    shares = (float(100 * NOISE * np.sqrt(2 / runs) / peak) for peak in peaks)
-    return Tolerance("measured: twice the noise of a sensor (5.1), in both peaks", 0, tuple(shares))
+    points = (float(100 * NOISE * np.sqrt(2 / runs) / peak) for peak in peaks)
+    return Tolerance("measured: twice the noise of a sensor (5.1), in both peaks", 0, tuple(points))
 
 
 SAME_CURVE = Tolerance("called identical: the width of a line in a figure", absolute=1.0)

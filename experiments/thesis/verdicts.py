@@ -84,9 +84,9 @@ class Finding:
         return self.published.agrees(self.values(reading))
 
     def null_within_tolerance(self, reading: Reading) -> np.ndarray:
-        """Whether the null model meets each number, or cannot be told from the reading, (number,).
+        """Whether the null model meets each number, or agrees with the reading, (number,).
 
-        It cannot where both differ by less than the tolerance.
+        They agree where both differ by less than the tolerance.
         """
         with np.errstate(invalid="ignore"):  # infinite limits
             apart = np.abs(self.null.values - self.values(reading))

@@ -1,4 +1,4 @@
-"""What the likelihood of a log is expected to gain from a mode, whatever the method.
+"""Expected gain of the log likelihood of a log by a mode, whatever the method.
 
 The logarithm of the likelihood ratio of the true model and the best one without the mode is, on
 average over logs, the least Kullback-Leibler divergence of their spectra.
@@ -19,7 +19,7 @@ def expected_gain(planted: Planted, mode: int, duration: float, shaken: bool = F
     """Expected log likelihood of the log with the mode, above that of the best model without it.
 
     `shaken` is that of `random_response`. The search begins without the mode, and with the nearest
-    other mode in its place; modes elsewhere stay there, also those that are too weak to tell.
+    other mode in its place; modes elsewhere stay there, also those that are too weak to identify.
     """
     response = random_response(planted, duration, shaken)
     unknowns = response.unknowns

@@ -5,10 +5,10 @@ No unbiased method has smaller variances than the inverse of Fisher's informatio
 random forces and the frequencies of lines, the number of modes, and that shapes are real. Unknown
 are frequencies, damping ratios, shapes and, of random forces, their places.
 
-A log does not tell a mode if the interval of its damping ratio holds zero all the same, if that of
-its frequency holds a neighbour within its half-power bandwidth, if a model without it is expected
-to do as well (`expected_gain`), or if it is nearer to a harmonic of a machine than the resolution
-of the log: a harmonic of fluctuating amplitude and phase responds like the mode.
+A mode is not identifiable from a log if the least interval of its damping ratio holds zero, if that
+of its frequency holds a neighbour within its half-power bandwidth, if a model without it is
+expected to do as well (`expected_gain`), or if it is nearer to a harmonic of a machine than the
+resolution of the log: a harmonic of fluctuating amplitude and phase responds like the mode.
 """
 
 from collections.abc import Callable
@@ -211,10 +211,13 @@ def _of_information(information, unknowns) -> LeastErrors:
     return LeastErrors(deviations[:, 0], deviations[:, 1])
 
 
-def why_untold(
+def why_unidentifiable(
     planted: Planted, mode: int, errors: LeastErrors, duration: float, gain: float = np.inf
 ) -> str:
-    """Why a log of a duration (s) does not tell a mode of an `expected_gain`; empty if it may."""
+    """Reason why a mode is not identifiable from a log of a duration (s); empty if it may be.
+
+    `gain` is its `expected_gain`.
+    """
     structure = planted.structure
     frequency, damping = structure.frequencies[mode], structure.damping_ratios[mode]
     lines = [line for line in planted.lines if abs(line - frequency) < 1 / duration]

@@ -2,7 +2,7 @@
 
 Written by `planted_modes`, beside its table. The least 95 % intervals are those of an unbiased
 method that knows the noise, the number of modes, and more (`least_errors`); what pyOMA-2 finds
-stable within 2 % of the mode, told where to look, is in the last column: it may be a harmonic.
+stable within 2 % of the mode, given its frequency, is in the last column: it may be a harmonic.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from experiments.validation.least_errors import (
     least_errors,
     least_errors_of_decays,
     least_errors_of_forced,
-    why_untold,
+    why_unidentifiable,
 )
 from experiments.validation.modal_identification import PlantedComparison
 from experiments.validation.modal_methods import pyoma
@@ -40,7 +40,7 @@ def missed_rows(kind: str, words: str, seed: int, found: PlantedComparison) -> l
         gain = np.inf
         if kind in RANDOM:
             gain = expected_gain(planted, mode, duration, kind == "shaken")
-        reason = why_untold(planted, mode, errors, duration, gain)
+        reason = why_unidentifiable(planted, mode, errors, duration, gain)
         least = (
             f"{QUANTILE * errors.frequencies[mode]:.2g} Hz",
             f"{QUANTILE * errors.damping_ratios[mode]:.2g}",

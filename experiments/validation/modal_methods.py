@@ -6,7 +6,7 @@
 Random structures by finite elements (`tests/oracles/planted_structures.py`) under ambient
 excitation, with coloured noise of 5 to 30 % rms. pyOMA-2 (extra `test`) runs its covariance-driven
 SSI with its own criteria of stability; a mode is found if five of its poles within 2 % of the truth
-are stable, and their median is its estimate: it is told where to look, ours is not. The second
+are stable, and their median is its estimate: it is given the frequency, ours is not. The second
 command takes other excitations, unknown or measured, with what `identify_modes` chooses by itself;
 pyOMA-2 uses the responses only. The tables are written for the page on logs.
 """

@@ -26,7 +26,7 @@ from experiments.studies.patch_drift import (
     fitted_creep,
     lags_of,
     log_of_patch,
-    what_is_left,
+    remaining_errors,
 )
 from experiments.studies.shaker_drives import LOOPS, drive
 from experiments.studies.tune_feedforward import COMMAND_LIMITS
@@ -221,7 +221,7 @@ def test_what_the_page_says_is_lost_against_laws_of_their_own():
 
 
 def test_what_the_page_says():
-    left = what_is_left(fitted_creep(log_of_patch(), "u", "w"))
+    left = remaining_errors(fitted_creep(log_of_patch(), "u", "w"))
     assert_allclose(left, [0.096, 0.045, 0.021], atol=5e-4)
 
 
@@ -229,7 +229,7 @@ def test_the_true_operators_leave_nothing():
     """But the scale: that of the first excursion to 7 V."""
     true = CreepFit(HYSTERESIS, CREEP, 1.0, 0.0, 0.0, 0.0)
     scale = float(HYSTERESIS.first_output(np.asarray(7.0))) / 7.0
-    assert_allclose(what_is_left(true).compensated, 1 / scale - 1, atol=1e-9)
+    assert_allclose(remaining_errors(true).compensated, 1 / scale - 1, atol=1e-9)
 
 
 # The tuned laws from sensors alone in the repository: bounds, held-out loads, and stability.

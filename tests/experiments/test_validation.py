@@ -15,7 +15,7 @@ from experiments.validation.least_errors import (
     least_errors_of_decays,
     least_errors_of_forced,
     random_response,
-    why_untold,
+    why_unidentifiable,
 )
 from experiments.validation.modal_methods import PYOMA, ours, pyoma, table
 from experiments.validation.modal_setups import HEADER, REFERENCES, assess, planted_setups
@@ -111,7 +111,7 @@ def test_least_errors_of_decays_are_those_of_a_damped_sinusoid(count):
 def test_why_a_log_does_not_tell_a_mode():
     def why(frequencies, damping, noise=1e-3, lines=(), duration=300.0):
         one = planted(frequencies, damping, noise, lines)
-        return why_untold(one, 0, least_errors(one, duration), duration)
+        return why_unidentifiable(one, 0, least_errors(one, duration), duration)
 
     assert why([4.0, 6.0], [0.01, 0.01]) == ""
     assert "damping ratio" in why([4.0, 6.0], [0.01, 0.01], noise=1e4)
@@ -155,8 +155,8 @@ def test_nothing_is_gained_from_a_mode_that_another_can_be():
     assert gains[0] < TELLING_GAIN < gains[2] and gains[1] < gains[2]
     pair = planted([4.0, 4.2], [0.02, 0.02])
     errors = least_errors(pair, 300.0)
-    assert not why_untold(pair, 1, errors, 300.0, gains[2])
-    told = why_untold(pair, 1, errors, 300.0, abs(gains[0]))
+    assert not why_unidentifiable(pair, 1, errors, 300.0, gains[2])
+    told = why_unidentifiable(pair, 1, errors, 300.0, abs(gains[0]))
     assert told.startswith("a model without it is as likely but for 0.0")
 
 

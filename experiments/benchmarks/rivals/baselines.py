@@ -74,8 +74,8 @@ class PinnedBeam:
         return 2 / self.length * np.transpose([turns, np.array(roots)]).ravel()[: self.modes]
 
     @cached_property
-    def sinh_share(self):
-        """Share of sinh k s in mode shapes, (mode,): nonzero for modes clamped in the middle."""
+    def sinh_factors(self):
+        """Coefficient of sinh k s in mode shapes, (mode,): nonzero if clamped in the middle."""
         if self.spans == 1:
             return np.zeros(self.modes)
         angles = self.wavenumbers * self.length / 2
@@ -89,7 +89,7 @@ class PinnedBeam:
     @cached_property
     def mode_amplitudes(self):
         """Amplitude of the mass-normalised modes, (mode,) in 1/sqrt(kg)."""
-        return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.sinh_share**2)))
+        return np.sqrt(2 / (self.mass_per_length * self.length * (1 - self.sinh_factors**2)))
 
     def shapes(self, position, derivative=0):
         """Mode shapes at a position (m), (mode,) in 1/sqrt(kg), or slopes, in 1/(m sqrt(kg))."""
@@ -97,7 +97,7 @@ class PinnedBeam:
         s, k = (self.length - position if right else position), self.wavenumbers
         wave, grown = (np.sin, np.sinh) if derivative == 0 else (np.cos, np.cosh)
         shape = (
-            k**derivative * self.mode_amplitudes * (wave(k * s) - self.sinh_share * grown(k * s))
+            k**derivative * self.mode_amplitudes * (wave(k * s) - self.sinh_factors * grown(k * s))
         )
         return self.symmetry_signs * (-1) ** derivative * shape if right else shape
 
@@ -151,7 +151,7 @@ def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
     signed_amplitude = beam.mode_amplitudes * (beam.symmetry_signs if span else 1.0)
     slope_factor = 2 * speed * (-1) ** span * signed_amplitude * k
     curvature_factor = -((speed * k) ** 2)
-    has_sinh = np.any(beam.sinh_share != 0)
+    has_sinh = np.any(beam.sinh_factors != 0)
 
     def accelerations(q, velocity):
         """Accelerations of the modes without a mass, (mode, run)."""
@@ -169,9 +169,9 @@ def crossing_rate(beam, masses, speed, span: int | None = 0, modal_forces=None):
         phi, two_speed_slope = signed_amplitude * xp.sin(angle), slope_factor * xp.cos(angle)
         curvature = curvature_factor * phi  # times speed^2
         if has_sinh:
-            grown = signed_amplitude * beam.sinh_share * xp.sinh(angle)
+            grown = signed_amplitude * beam.sinh_factors * xp.sinh(angle)
             phi, curvature = phi - grown, curvature + curvature_factor * grown
-            two_speed_slope = two_speed_slope - slope_factor * beam.sinh_share * xp.cosh(angle)
+            two_speed_slope = two_speed_slope - slope_factor * beam.sinh_factors * xp.cosh(angle)
         free = accelerations(q, velocity)
         convected = phi @ free + curvature @ q + two_speed_slope @ velocity
         force = masses * (GRAVITY + convected) / (1 + masses * (phi @ phi))
@@ -281,7 +281,7 @@ def scipy_histories(beam, masses, speeds, times, tolerance=SCIPY_TOLERANCE):
 def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
     """Time of `solve(beam, masses, speeds)` for all of these, scaled from a sample of `runs`.
 
-    The time of a run is a constant plus a share proportional to its duration, L / v; both are
+    The time of a run is a constant plus a part proportional to its duration, L / v; both are
     fitted to runs at speeds spread over all, each with another mass, each timed `repeat` times. A
     function `reference` is called between them for the ratio.
     """

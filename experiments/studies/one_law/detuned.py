@@ -1,12 +1,12 @@
-"""The one law on beams whose rigidity nobody told it, and two ways to make up for that.
+"""The one law on beams whose rigidity it does not know, and two ways to make up for that.
 
     python -m experiments.studies.one_law.detuned   # prints; with --pages writes docs/_static too
 
 The law is designed for the rigidity as printed, with delays of 0, 20 and 40 ms behind the filter of
 10 Hz; the beam is softer or stiffer by a factor. Beside it, on the same held-out loads:
 
-- the law told the true rigidity: what an identification without error would give;
-- the law with numbers sought anew for the worst of beams whose rigidity it is not told (0.85, 1 and
+- the law designed for the true rigidity, as after an identification without error;
+- the law with numbers optimised for the worst of beams whose rigidity it does not know (0.85, 1 and
   1.15 of the printed one; delays of 0 and 40 ms; training loads), by the strategy of `tune` over
   the same equations with fixed steps of 1 ms, in 60 generations, and rounded.
 
@@ -40,12 +40,12 @@ OUTER_MASSES = 0.2, 0.6  # kg
 OUTER_SPEEDS = {"B": (0.4, 1.05), "C": (0.6, 1.05)}  # m/s
 # Sizes of the values below zero and above, and the reference: see `tune`.
 WORST_CASE = np.array([1.0, 0.64, 0.14, 0.3, 0.39, 0.59, 0.69, 0.82, 0.93, 1.0, 0.49])
-HEADER = "rigidity", "told nothing", "told the rigidity", "sought for the worst", "other loads"
+HEADER = "rigidity", "not known", "known to the law", "law for the worst case", "other loads"
 SPANS = {"B": "one span", "C": "two spans"}
 
 
-def told(case: jb.Case, factor: float) -> jb.Case:
-    """The case with a factor on its rigidity, for which its law is designed."""
+def with_known_rigidity(case: jb.Case, factor: float) -> jb.Case:
+    """Case with a factor on its rigidity, for which its law is designed too."""
     return jb.replace(case, {RIGIDITY: factor * float(case.beam.flexural_rigidity)})
 
 
@@ -73,11 +73,11 @@ def over_delays(
 
 def row(rig: str, factor: float, shares: Shares) -> tuple[str, ...]:
     """Cells of a rig and a factor on its rigidity."""
-    known, others = held_out_loads(rig), outer_loads(rig)
+    held_out, others = held_out_loads(rig), outer_loads(rig)
     ways = (
-        (lambda case: with_rigidity(case, factor), known),
-        (lambda case: told(case, factor), known),
-        (lambda case: with_rigidity(with_numbers(case, WORST_CASE), factor), known),
+        (lambda case: with_rigidity(case, factor), held_out),
+        (lambda case: with_known_rigidity(case, factor), held_out),
+        (lambda case: with_rigidity(with_numbers(case, WORST_CASE), factor), held_out),
         (lambda case: with_rigidity(case, factor), others),
     )
     found = (cell(over_delays(rig, way, loads, shares)) for way, loads in ways)

@@ -1,4 +1,4 @@
-"""What the law for all rigs must know, identified by a probe before the load enters.
+"""Plant parameters that the law for all rigs needs, identified by a probe without a load.
 
     python -m experiments.studies.one_law.identified_plant
 

@@ -1,4 +1,4 @@
-"""What the one law loses against the same law tuned for each plant alone; held-out loads.
+"""Loss of the one law against the same law tuned for each plant alone; held-out loads.
 
     python -m experiments.studies.one_law.per_plant   # prints; with --pages writes docs/_static too
 
@@ -53,7 +53,7 @@ def losses(rig: str, delay: float, factor: float) -> Float[np.ndarray, "law load
 
 
 def main(arguments: list[str]) -> None:
-    """Print a row for each plant, and what is lost; write them for the page with `--pages`."""
+    """Print a row for each plant, and the losses; write them for the page with `--pages`."""
     plants = list(itertools.product("BC", DELAYS, FACTORS))
     rows, lost = [HEADER, ("---", *("---:",) * (len(HEADER) - 1))], []
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:

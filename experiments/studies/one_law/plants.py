@@ -124,7 +124,7 @@ def rows(shares: Shares) -> list[tuple[str, ...]]:
             for sign in (-1, 1)
         ]
         wrong += [cell(np.concatenate(values)), "", ""]
-    found.append(("5 and 20 Hz, 20 ms, told wrong numbers", *wrong))
+    found.append(("5 and 20 Hz, 20 ms, given wrong numbers", *wrong))
     print(" | ".join(found[-2]), " | ".join(found[-1]), sep="\n", flush=True)
     return found
 

@@ -227,10 +227,10 @@ def _static_deflections(case: jb.Case) -> np.ndarray:
 
 
 def amplification_at(case: jb.Case, mass: float, ratio: float) -> dict[str, np.ndarray]:
-    """Amplification at each sensor, (sensor,), by what it is the largest of, at one mass and speed.
+    """Amplification at each sensor, (sensor,), at one mass and speed, by the time it is of.
 
-    Of the whole run, while the load is on the beam, and after its exit; the last two are read from
-    samples at `SAMPLE_RATE`.
+    Times are the whole run, while the load is on the beam, and after its exit; the last two are
+    read from samples at `SAMPLE_RATE`.
     """
     speed = ratio * critical_speed(case)
     crossing = float(case.beam.length) / speed
@@ -251,7 +251,7 @@ def amplification_at(case: jb.Case, mass: float, ratio: float) -> dict[str, np.n
 def _at_points(
     case: jb.Case, answers: tuple[str, ...], points
 ) -> dict[tuple[str, ...], np.ndarray]:
-    """Amplification (point,) by the answers, which hold for the case, and what it is largest of.
+    """Amplification (point,) by the answers, which hold for the case, and by the time it is of.
 
     Points are a mass (kg), or None for a moving force, a speed ratio, and the number of a sensor.
     """
@@ -301,7 +301,7 @@ def run(load_rig) -> ExperimentResult:
 
 
 def _one_span_finding(one: jb.Case) -> Finding:
-    """Fig. 2.25, by the beam, the spring of the shaker, and what the amplification is of."""
+    """Finding on Fig. 2.25, by the beam, the spring of the shaker, and the time of the peak."""
     values = {}
     spring = jb.Support(SHAKER_POSITION, stiffness=SHAKER_STIFFNESS)
     for name, beam in beams_of_rig_a(one.beam).items():
@@ -432,7 +432,7 @@ def _peak_difference(case: jb.Case, volts: float) -> float:
 
 
 def _unknown_voltage(peak_differences) -> str:
-    """Why the difference of Fig. 2.24 depends on the voltage, which is not printed; or empty."""
+    """Sentence on the voltage, not printed, that the difference of Fig. 2.24 needs; or empty."""
     if not peak_differences[0] < published.FORCE_MASS_DIFFERENCE.numbers[0] < max(peak_differences):
         return ""
     return (

@@ -77,7 +77,7 @@ def peak_ratios(rig: jb.Case, speed: float, mass: float) -> dict[str, dict[str, 
 
 
 def claims(ratios) -> Finding:
-    """What the thesis says of Figs 5.14 and 5.15, 1 where it holds."""
+    """Finding on the claims of the thesis about Figs 5.14 and 5.15, 1 where one holds."""
     names = list(COMBINATIONS)
     first, both, printed, all_states = (
         names.index(key) for key in ("q1", "q1 q2", "q1 q2 q1'", "all")
@@ -115,7 +115,7 @@ HORIZONS = {"finite-time": "crossing", "step-by-step": "frozen", "constant": "in
 
 
 def gains_over_crossing(rig: jb.Case, horizon: str, mass: float) -> np.ndarray:
-    """Gains (share of the crossing, state) of q1, q2 and rate of q1 over a horizon, in V/m, V s/m.
+    """Gains (fraction, state) of q1, q2 and rate of q1 along a crossing, in V/m and V s/m.
 
     They are those of the slow crossing of Fig. 5.16.
     """

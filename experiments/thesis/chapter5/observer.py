@@ -193,7 +193,7 @@ def _peak_reduction(uncontrolled: ObservedLoop, controlled: ObservedLoop) -> flo
 
 
 def _remark(loops: Mapping[str, tuple[ObservedLoop, ...]]) -> str:
-    """What the sampling period costs: reductions, and how far the observer is off."""
+    """Sentence on the effect of the sampling period: reductions, and errors of the observer."""
     parts = []
     for name, (uncontrolled, controlled) in loops.items():
         q1, estimated = controlled.states[:, 0], controlled.estimates[:, 0]

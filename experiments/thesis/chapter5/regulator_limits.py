@@ -102,7 +102,7 @@ def _gain_finding(numbers, case, period, weights) -> Finding:
 
 
 def _instability(case: jb.Case, period: float, gain: np.ndarray) -> str:
-    """Why a printed gain is the optimum of no shaker: all loops are unstable under it. Or empty.
+    """Sentence why no shaker has a printed gain as its optimum: all loops are unstable; or empty.
 
     An optimal gain stabilises the loop that it is designed for.
     """
@@ -193,7 +193,7 @@ def frozen_pole_findings(interpretations: Mapping[str, TimeVaryingLoops]) -> lis
 
 
 def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
-    """Growth of deviations in the loops with few states, which frozen poles do not show."""
+    """Sentence on growth of deviations in loops with few states, invisible to frozen poles."""
     parts = []
     for name, loops in interpretations.items():
         for speed in SPEEDS:

@@ -38,7 +38,7 @@ LAWS = {
 
 
 class RegulatorInterpretation(NamedTuple):
-    """How the printed regulator is interpreted: plant, command weight, and states fed back.
+    """Interpretation of the printed regulator: plant, command weight, and states fed back.
 
     `force_per_volt` (N/V) and `stiffness` (N/m) are those of the plant's shaker. The law is
     designed for `design_force` (N/V), on the rig of `with_other_shaker` if `other` is set.
@@ -78,7 +78,7 @@ def regulator(
 ) -> AbstractController:
     """A regulator of chapter 5, designed for a force per volt (N/V).
 
-    `kind` is a key of LAWS, `feedback` the share of each state that is fed back, and `damping`
+    `kind` is a key of LAWS, `feedback` the fraction of each state that is fed back, and `damping`
     (N s/m) that of the suspension in the design, as in the plant if left out.
     """
     return jb.LQR(
@@ -143,8 +143,8 @@ class RegulatorRuns:
     ) -> float:
         """Largest deflection (m) at 0.25 m under a law designed for one case, on another shaker.
 
-        `name` is the interpretation, `kind` a key of LAWS or NO_CONTROL. `feedback` is the share of
-        each state that is fed back, and `design_mass` (kg) the load that the law is designed for.
+        `name` is the interpretation, `kind` a key of LAWS or NO_CONTROL. `feedback` is the fraction
+        of each state that is fed back, `design_mass` (kg) the load that the law is designed for.
         """
         design = jb.replace(design, {"loads.0.mass": mass, "loads.0.speed": speed})
         plant = dataclasses.replace(design, actuators=(actuator,))

@@ -26,7 +26,7 @@ SAMPLE_RATE = 500.0  # Hz
 def oscillation_findings(
     case: jb.Case, answers: Mapping[tuple[str, ...], Mapping[str, float]]
 ) -> tuple[list[Finding], Figure]:
-    """Whether a slow, heavy load makes the loop oscillate, and the frequency of that (Hz).
+    """Findings on the oscillation of the loop under a slow, heavy load (yes or no, Hz); Fig. 6.4.
 
     `case` is rig B under the cubic law; the cutoff of the filter is varied, for all `answers`, of
     which the last has the damping of the figure.

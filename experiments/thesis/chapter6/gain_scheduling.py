@@ -245,14 +245,14 @@ def static_schedule(case: jb.Case, heaviest: float, correction: float) -> tuple[
 
 
 def uncontrolled_schedule(case: jb.Case, heaviest: float) -> tuple[float, ...]:
-    """The same by the static deflection without control: k = 2 w^2, w in mm."""
+    """Switching masses (kg) and equal gain (V/mm) by k = 2 w^2, w in mm without control."""
     deflection = 1e3 * float(static_extremes(case)[0][0])  # mm/kg
     masses = np.sqrt(np.array([GAIN, HIGHER_GAINS[0]]) / GAIN) / deflection
     return float(masses[0]), float(masses[1]), GAIN * (deflection * heaviest) ** 2
 
 
 def _rounding_remark(case: jb.Case) -> str:
-    """What the digits of the printed E I and gain margin leave open of the first mass by statics.
+    """Sentence on the error of the first mass by statics, by rounding of E I and gain margin.
 
     `case` is rig B.
     """
@@ -278,7 +278,7 @@ def schedule_findings(
     equal_gains,
     fitted: str,
 ) -> list[Finding]:
-    """The scheduled gains of Fig. 6.7 and the gain margin, by `answers`, crossings and statics.
+    """Findings on the gains of Fig. 6.7 and the gain margin, by `answers`, crossings and statics.
 
     The answer `fitted` is c_p by the margin. `switches` (kg) and `equal_gains` (V/mm) are those of
     crossings, by answer.

@@ -157,7 +157,7 @@ def _two_spans(case):
 
 
 def _reduced_model_finding(case: jb.Case) -> Finding:
-    """Whether a controller designed on 3 modes reduces the peaks of a beam with 12."""
+    """Finding on the peaks of a beam with 12 modes under a controller designed on 3 modes."""
     twelve = with_modes(case, 12)
     free = jb.simulate(twelve, tolerance=TOLERANCE)
     controlled = simulate_mpc(twelve, 2, 1, modes=3)
@@ -212,7 +212,7 @@ def _reductions_by_half(uncontrolled: jb.Record, controlled: jb.Record) -> np.nd
 def _saturation_time(
     record: jb.Record, actuator: int, limit: float, tolerance: float = 1e-6
 ) -> float:
-    """First time (s) at which a command is at a limit (V), within a share of it; NaN if never."""
+    """First time (s) at which a command is at a limit (V), to a relative tolerance; or NaN."""
     command = np.asarray(record.command)[:, actuator]
     at_limit = np.abs(command - limit) < tolerance * abs(limit)
     return float(record.times[np.argmax(at_limit)]) if at_limit.any() else np.nan

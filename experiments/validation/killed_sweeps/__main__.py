@@ -41,7 +41,7 @@ CASE = jb.Case(
 
 
 class KilledSweep(NamedTuple):
-    """Of one sweep: what was killed, what clients said, and the laws that it broke."""
+    """Outcome of a sweep: processes killed, messages of clients, and the laws that it broke."""
 
     killed: Counter
     said: Counter
@@ -128,7 +128,7 @@ def run(
 
 
 def _wait(client: subprocess.Popen, store: Path, outcome: KilledSweep) -> str:
-    """What a client said when it has ended; it is killed if no block is finished for LONGEST."""
+    """Output of a client after its end; it is killed if no block is finished for LONGEST."""
     done, last = finished(store), time.monotonic()
     while True:
         try:
@@ -166,7 +166,7 @@ def _kill_later(
 
 
 def _one_sentence(said: str, faults: list[str]) -> str:
-    """What a client said last; anything but a sentence of its own, after Dask's log, is a fault."""
+    """Last line of a client; anything but one sentence of its own, after Dask's log, is a fault."""
     lines = [line for line in said.splitlines() if line.strip()]
     if not lines or not lines[-1].startswith("jaxbeam: "):
         faults.append(f"a client ended with: {said[-2000:]}")

@@ -32,7 +32,7 @@ OUT = Path(__file__).parents[3] / "out"
 PAGE = Path(__file__).parents[3] / "docs" / "_static" / "random_cases.md"
 
 
-def known_outcomes(file: Path) -> dict[int, Outcome]:
+def stored_outcomes(file: Path) -> dict[int, Outcome]:
     """Outcomes in a file, by index; a last line that is cut off is left out."""
     outcomes = {}
     for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else []:
@@ -56,7 +56,7 @@ def outcomes_of(
 
     Those that take longer than `longest`, in seconds of the processor, are left.
     """
-    outcomes, start = known_outcomes(file), time.perf_counter()
+    outcomes, start = stored_outcomes(file), time.perf_counter()
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a", encoding="utf-8") as lines:
         for index in range(count):
@@ -71,7 +71,7 @@ def outcomes_of(
 
 
 def broken_laws(outcomes: Sequence[Outcome]) -> list[str]:
-    """What is not as it must be: a line for each fault, and one for errors above the stated."""
+    """Lines on broken laws: one for each fault, and one for errors above the stated."""
     lines = [f"case {one.index}: {fault}" for one in outcomes for fault in one.faults]
     above = [one.index for one in outcomes if one.exceeds]
     compared = [one for one in outcomes if one.largest is not None]

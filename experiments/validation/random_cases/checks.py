@@ -1,4 +1,4 @@
-"""What a random case is checked for: finite numbers, true verdicts, stated errors that hold.
+"""Checks of random cases: finite numbers, true verdicts, stated errors that hold.
 
 Draws of random valid cases: heavy and fast loads, many modes, events that coincide.
 
@@ -117,7 +117,7 @@ SCIPY_LONGEST = 10.0  # s of the processor, of an integration by scipy
 
 
 class Outcome(NamedTuple):
-    """What was found of a case; errors are relative to the largest deflection."""
+    """Result of the checks of a case; errors are relative to the largest deflection."""
 
     index: int
     modes: int
@@ -188,7 +188,7 @@ def at_most(seconds: float) -> Iterator[None]:
 
 
 def check(seed: int, index: int, longest: float = np.inf, plain: bool = False) -> Outcome:
-    """Draw a case and check it, for some processor time (s) at most.
+    """Outcome of a drawn case, checked for at most `longest` (s) of processor time.
 
     A `plain` check has no run of tighter tolerance: numbers are finite, the verdict agrees with
     them, and the sample that is integrated by scipy agrees with that.
@@ -259,7 +259,7 @@ def _along(record: Record) -> np.ndarray:
 
 
 def nan_faults(record: Record) -> list[str]:
-    """Numbers that are not finite in a record whose verdict tells nothing of it."""
+    """Lines on numbers that are not finite in a record whose verdict does not say so."""
     if "diverges" in record.verdict:
         return []
     may_be_nan = {"load_position", "contact_lost_time", "contact_lost_position"}
