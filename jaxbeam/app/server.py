@@ -64,7 +64,7 @@ class Guard:
             nonlocal received
             message = await receive()
             received += len(message.get("body", b""))
-            if received > most:  # of a body that does not tell its length
+            if received > most:  # of a body without a stated length
                 return {"type": "http.disconnect"}
             return message
 

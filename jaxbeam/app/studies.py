@@ -131,9 +131,9 @@ def read_logs(path: Path, options: Mapping[str, Any]) -> list[Any]:
     import tuning
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the notes and faults of the log tell it
+        warnings.simplefilter("ignore")  # they are among the faults of the log
         logs = tuning.read_logs(path, **options)
-    folder = f"{path.parent}/"  # of the server: no one's who drops a log on the page
+    folder = f"{path.parent}/"  # of the server: not shown on the page
     return [dataclasses.replace(log, source=log.source.removeprefix(folder)) for log in logs]
 
 

@@ -149,13 +149,13 @@ def _child(node: Any, key: str, address: str) -> Any:
     raise ValueError(f"there is no place {address} in the file")
 
 
-KEPT = 6  # cases, records and prepared simulations that are remembered
+KEPT = 6  # cases, records and simulators in the caches
 PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 1e-2, 201  # of pictures while a slider moves
 MAX_BYTES = 2 * 2**20  # of the text of a case
 _STARTERS = resources.files("jaxbeam") / "files" / "starters"
 
 
-class Remembered:
+class ResultCache:
     """Cache of results for the last few keys."""
 
     def __init__(self, size: int = KEPT):
@@ -179,8 +179,8 @@ class Workspace:
 
     def __init__(self, folder: str | os.PathLike):
         self.folder = Path(folder).resolve()
-        self._cases, self._records, self._simulators = Remembered(), Remembered(), Remembered()
-        self._library = Remembered(100)
+        self._cases, self._records, self._simulators = ResultCache(), ResultCache(), ResultCache()
+        self._library = ResultCache(100)
         self._jobs: dict[str, Any] = {}
         self._log_options: dict[str, dict[str, Any]] = {}
         self._uploads = tempfile.TemporaryDirectory(prefix="jaxbeam-")
@@ -294,7 +294,7 @@ class Workspace:
         """Text after changes; see `changed`."""
         try:
             case = self.case(text)
-        except ValueError:  # it is being mended
+        except ValueError:  # the text is not valid yet
             case = None
         return changed(text, changes, case)
 
@@ -305,7 +305,7 @@ class Workspace:
 
         def compute():
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ContactLossWarning)  # the verdict tells it
+                warnings.simplefilter("ignore", ContactLossWarning)  # the verdict says so
                 return jb.simulate(self.case(text))
 
         with self._computing:
@@ -475,7 +475,7 @@ class Workspace:
                 state["result"] = job.result()
             except jb.api.Cancelled:
                 state["problem"] = jb.api.Problem("stopped")._asdict()
-            except Exception as error:  # of whatever work, for who looks at it
+            except Exception as error:  # any error of a job is shown on the page
                 state["problem"] = jb.api.problem(error)._asdict()
         return state
 

@@ -69,7 +69,7 @@ def _read_points(path: Path, below: Path | None = None) -> tuple[list[float], li
             points.append((float(cells[0]), float(cells[1])))
         except (ValueError, IndexError):
             if points or has_names or len(cells) < 2:
-                # What the line says is not quoted: the file may be one of secrets.
+                # The line is not quoted: the file may hold secrets.
                 raise ValueError(
                     f"{path}, line {number}: a line of a profile is a position and a height in m,"
                     " such as 12.5, 0.003, which this is not"

@@ -58,7 +58,7 @@ def simulate(
     from jaxbeam.simulation.simulate import ContactLossWarning
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ContactLossWarning)  # the verdict tells it
+        warnings.simplefilter("ignore", ContactLossWarning)  # the verdict says so
         record = jb.simulate(parsed_case)
     if output:
         record.save(output, options.overwrite)

@@ -18,7 +18,7 @@ from jaxbeam.simulation.record import Record
 
 WHEEL_SIZE, PLAIN_SIZE = 7.0, 10.0  # points, of wheels of vehicles and of other loads
 AXES_HEIGHT = 175.0  # points, about that of the axes of a beam with vehicles
-PROFILE_SHARE = 0.2  # of the range of deflections, for the height of the profile
+PROFILE_FRACTION = 0.2  # of the range of deflections, for the height of the profile
 APPROACH = 0.15  # of the length of the beam, shown before and behind it where there are vehicles
 
 
@@ -64,7 +64,7 @@ class Traffic:
     def draw(self, axes) -> Callable[[int], None]:
         """Set the limits of the axes and draw the loads; returns a function that moves them.
 
-        If the profile is rough beside the deflections, heights r of the profile and u of the bodies
+        If the profile is high against the deflections, heights r of the profile and u of the bodies
         are drawn k times as large: the surface at w + k r, bodies at k u + (1 - k) w.
         """
         case, loads = self._record.case, self._loads
@@ -75,7 +75,7 @@ class Traffic:
             tallest = max(one.height for one in vehicle_art(axes, case, WHEEL_SIZE, 1.0))
             margin = min(0.7, (tallest * WHEEL_SIZE + 14.0) / AXES_HEIGHT)
         rough = np.max(np.abs(self._profile))
-        scale = min(1.0, PROFILE_SHARE * height_range / rough) if rough > 0 else 1.0
+        scale = min(1.0, PROFILE_FRACTION * height_range / rough) if rough > 0 else 1.0
         motion, profile = scale * self._motion(), scale * self._profile
         bottom += min(0.0, np.min(profile))
         top += max(0.0, np.max(profile), np.max(self._heights(motion), initial=0.0) - high)
