@@ -21,7 +21,7 @@ PAGES = Path(__file__).parents[2] / "docs" / "_static" / "benchmarks"
 
 
 class Benchmark(NamedTuple):
-    """What a benchmark compares; options for a short run, and for what the pages show of it."""
+    """Benchmark: what it compares, options for a short run, and options for the pages."""
 
     about: str
     quick: str = ""
@@ -91,7 +91,7 @@ def main() -> None:
 
 
 def write_page(name: str, printed: str) -> None:
-    """What a benchmark printed, as a part of a page of the site, with cores, load and date.
+    """Part of a page of the site: the output of a benchmark, with cores, load and date.
 
     The load is the mean number of processes that ran or waited in the last minute, the benchmark
     included: times are good where it is not above the number of cores. How long all took is left

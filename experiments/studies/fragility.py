@@ -27,7 +27,7 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 
 RIG, MASS, SPEED = "B", 0.42, 0.55  # kg, m/s: a held-out load
 HEADWAY, DECELERATION = 0.4, 0.2  # s; m/s^2: the load leaves with less than half of its speed
-GATE_ERROR, OTHER_CUTOFF = 0.1, 20.0  # share of the distance between the gates; Hz
+GATE_ERROR, OTHER_CUTOFF = 0.1, 20.0  # fraction of the distance between the gates; Hz
 CONFIRMATION = 2e-5  # m: five times the noise of a sensor
 TOLERANCE = 1e-4
 AS_TUNED = "as tuned for"

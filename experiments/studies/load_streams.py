@@ -29,7 +29,7 @@ WEIGHTS = {
     "period": 2e-3,
 }
 ENTRY_TIME_ERRORS = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])  # s
-MASS_ERRORS = np.array([-0.4, 0.0, 0.4])  # share of the mass
+MASS_ERRORS = np.array([-0.4, 0.0, 0.4])  # relative
 SENSOR, STEPS = 1, 4  # steps from sample to sample: the search finds one, two or four
 
 

@@ -25,7 +25,7 @@ LEAD = 0.005  # s: half of the sampling period, the mean delay of a held command
 GATES = (-0.2, -0.1)  # m: on the ramp before the beam, as the induction sensors of the thesis
 COMMAND_LIMITS, COMMAND_RESOLUTION = (-2.5, 7.5), 0.01  # V
 SPEEDS = {"B": np.linspace(0.3, 1.0, 12), "C": np.linspace(0.3, 1.0, 8)}  # m/s
-INITIAL_TABLES = {  # V at shares of the span
+INITIAL_TABLES = {  # V at fractions of the span
     "B": [([0.0, 0.2, 0.9, 1.0], [0.5, 6.8, 6.8, 0.0])],
     "C": [
         ([0.0, 0.1, 0.38, 0.55, 0.75, 1.0], [0.3, 6.8, 6.8, -1.8, -1.8, 0.0]),

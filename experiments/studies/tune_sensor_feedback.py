@@ -40,7 +40,7 @@ READING_BREAKPOINTS = {  # m: the table is flat where a heavy load has lowered t
 }
 SPEEDS = np.linspace(0.3, 1.0, 8)  # m/s
 INITIAL_TABLE = {"B": (0.45e-3, 7.2, 0.0), "C": (0.25e-3, 7.2, -1.8)}  # m, V below, V above
-RIGIDITY_TOLERANCE = 0.1  # share by which the plant may be stiffer or softer than the design model
+RIGIDITY_TOLERANCE = 0.1  # relative: the plant may be so much stiffer or softer than the design
 RIGIDITY_FACTORS = (1.0, 1.0 - RIGIDITY_TOLERANCE, 1.0 + RIGIDITY_TOLERANCE)
 # Poles along crossings: largest real part (1/s), speed of the loads (m/s), number of positions, and
 # distance (m) from the table's breakpoint at rest, on either side of which the slope differs.

@@ -98,7 +98,7 @@ def with_tables(text: str, report: Mapping) -> str:
 
 
 def shares_paragraph(text: str) -> str:
-    """What the page says first of the laws, in numbers of its tables.
+    """First paragraph of the page on the laws, with numbers of its tables.
 
     Raises KeyError if the page lacks a row.
     """

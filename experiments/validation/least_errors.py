@@ -21,7 +21,7 @@ from scipy.stats import norm
 from tests.oracles.planted_structures import FINER, WEAK, Planted, Structure, noise_spectrum
 
 QUANTILE = 1.96
-# Expected log likelihood that a mode gains, of which half of the logs tell it, if one of ten
+# Expected log likelihood that a mode gains if half of the logs identify it, where one of ten
 # thousand without it may: with both models known the gain has mean D and variance 2 D with the
 # mode, -D and 2 D without it.
 TELLING_GAIN = float(norm.isf(1e-4) ** 2 / 2)

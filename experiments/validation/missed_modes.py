@@ -64,7 +64,7 @@ def missed_rows(kind: str, words: str, seed: int, found: PlantedComparison) -> l
 
 
 def _planted(kind, seed) -> tuple[Planted, LeastErrors, float]:
-    """What was planted, the least errors under that excitation, and duration (s)."""
+    """Planted structure, the least errors under that excitation, and duration (s)."""
     structure = random_structure(seed)
     if kind in measured_forces.EXCITATIONS:
         log, planted = measured_forces.forced_log(structure, kind, seed)

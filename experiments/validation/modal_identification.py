@@ -21,7 +21,7 @@ from tuning.modal.identify_modes import identify_modes
 from tuning.modal.result import ModalEstimates
 
 KINDS = ("ambient", "motor", "shaken", "impacts", "decay", "crossing")
-MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
+MATCH_ERROR = 0.02  # relative error of a frequency within which a mode is one of the structure
 MIN_ENERGY = 0.05  # energy share of the modes that must be found
 DURATIONS = {
     "ambient": 300.0,
@@ -86,7 +86,7 @@ def compare(fit: ModalEstimates, planted: Planted) -> PlantedComparison:
     pairs: dict[int, int] = {}
     for flat in np.argsort(distance, axis=None):
         mine, planted_mode = divmod(int(flat), truth.size)
-        near = abs(fit.frequencies[mine] / structure.frequencies[planted_mode] - 1) < MATCH_SHARE
+        near = abs(fit.frequencies[mine] / structure.frequencies[planted_mode] - 1) < MATCH_ERROR
         if near and mine not in pairs and planted_mode not in pairs.values():
             pairs[mine] = planted_mode
     covered, errors = [], []

@@ -25,7 +25,7 @@ from experiments.validation.measured_forces import EXCITATIONS as MEASURED, forc
 from experiments.validation.modal_identification import (
     DURATIONS,
     FIRST_SEED,
-    MATCH_SHARE,
+    MATCH_ERROR,
     MIN_ENERGY,
     WORDS,
     compare,
@@ -109,7 +109,7 @@ def pyoma(planted: Planted) -> Estimates:
     nearest = np.argmin(np.abs(frequencies[:, None] / truth - 1), axis=1)
     errors = np.full((truth.size, 2), np.nan)
     for mode in range(truth.size):
-        near = np.abs(frequencies / truth[mode] - 1) < MATCH_SHARE
+        near = np.abs(frequencies / truth[mode] - 1) < MATCH_ERROR
         own = (nearest == mode) & near
         if own.sum() >= MIN_STABLE:
             ratio = planted.structure.damping_ratios[mode]

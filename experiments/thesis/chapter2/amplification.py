@@ -276,7 +276,7 @@ def run(load_rig) -> ExperimentResult:
     two = with_sensors(two_spans(load_rig), 0.3, 0.9, duration=DURATION)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # the maps show lost contact
-        warnings.simplefilter("ignore", PlausibilityWarning)  # speeds are meant
+        warnings.simplefilter("ignore", PlausibilityWarning)  # high speeds are intended
         mass_one = sweep_amplification(one, MASSES, ONE_SPAN_RATIOS)
         mass_two = sweep_amplification(two, MASSES, TWO_SPAN_RATIOS)
         force_one = sweep_amplification(as_moving_force(one), [1.0], ONE_SPAN_RATIOS)

@@ -39,8 +39,8 @@ COMBINATIONS = {
     "all": ALL_STATES,
 }
 BUT_FOR_THE_END = "but for the last tenth of the crossing"
-SHARES = np.linspace(0.0, 1.0, 401)[1:-1]  # of the crossing, at which gains are compared
-LAST_DRAWN = 0.95  # share up to which axes are scaled
+FRACTIONS = np.linspace(0.0, 1.0, 401)[1:-1]  # of the crossing, at which gains are compared
+LAST_DRAWN = 0.95  # fraction up to which axes are scaled
 FED_BACK = np.array([0, 1, 3])  # q1, q2 and the rate of q1 among the states
 POINTS = 800  # intervals of the tables of gains
 
@@ -125,17 +125,17 @@ def gains_over_crossing(rig: jb.Case, horizon: str, mass: float) -> np.ndarray:
     if horizon == "infinite":
         law = jb.LQR(*weights, coordinates="sine")
         constant = np.asarray(law.time_invariant_gain(plant))[0, FED_BACK]
-        return np.tile(constant, (SHARES.size, 1))
+        return np.tile(constant, (FRACTIONS.size, 1))
     law = jb.LQR(*weights, coordinates="sine", horizon=horizon, points=POINTS)
     table = law.gain_table(plant)
-    return np.stack([np.asarray(table(share)) for share in SHARES])[:, 0, FED_BACK]
+    return np.stack([np.asarray(table(fraction)) for fraction in FRACTIONS])[:, 0, FED_BACK]
 
 
 def identical_gains(gains) -> Finding:
     """Largest difference of the gains of both methods, in percent of the largest of each state."""
 
     def difference(name, shares):
-        chosen = shares(SHARES)
+        chosen = shares(FRACTIONS)
         expected, found = gains["finite-time"][chosen], gains[name][chosen]
         return [100 * np.max(np.abs(found - expected) / np.abs(gains["finite-time"]).max(axis=0))]
 
@@ -172,9 +172,9 @@ def draw_gains(gains) -> Figure:
     panels = figure.subplots(1, FED_BACK.size)
     for axes, label, column in zip(panels, ("q1", "q2", "q1'"), range(FED_BACK.size), strict=True):
         for i, (name, values) in enumerate(gains.items()):
-            axes.plot(SHARES, values[:, column], color=colour(i), label=name)
+            axes.plot(FRACTIONS, values[:, column], color=colour(i), label=name)
         # At the very end gains are many times as large.
-        drawn = np.stack([values[SHARES < LAST_DRAWN, column] for values in gains.values()])
+        drawn = np.stack([values[FRACTIONS < LAST_DRAWN, column] for values in gains.values()])
         low, high = drawn.min(), drawn.max()
         margin = 0.1 * (high - low)
         axes.set(title=f"gain of {label}", xlabel="share of the crossing")

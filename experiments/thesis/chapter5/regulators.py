@@ -25,7 +25,7 @@ from jaxbeam.simulation.integration_plan import IntegrationPlan
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)  # kg, m/s
 STATE_WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker
 COMMAND_WEIGHT = 9e-5  # R
-PRINTED_STATES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # share of each state that is fed back
+PRINTED_STATES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # fraction of each state that is fed back
 ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
 STEPS_PER_SAMPLE = {jb.Shaker: 2, jb.Electrodynamic: 6}
 SENSOR = 1  # at 0.25 m

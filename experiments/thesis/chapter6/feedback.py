@@ -107,7 +107,7 @@ def _two_spans(case: jb.Case):
 
 
 def _lightest_peak_proof(case: jb.Case) -> str:
-    """Why the printed peak of the lightest mass without control cannot be right; or empty.
+    """Proof that the printed peak of the lightest mass without control is not right; or empty.
 
     On the beam as printed, as stiff as its thickness may be rounded, at all speeds, each until the
     load has left, with damping up to that of the rig.
@@ -135,7 +135,7 @@ def _lightest_peak_proof(case: jb.Case) -> str:
 
 
 def _linear_law_proof(case: jb.Case) -> str:
-    """Why the printed peaks under the linear law cannot all be right; or empty."""
+    """Proof that the printed peaks under the linear law are not all right; or empty."""
     spread, masses = 0.0, [{"loads.0.mass": mass} for mass in MASSES]
     free = [float(one.peak_deflection[1]) for one in simulate_changes(case, masses)]
     for gain in LINEAR_GAINS:

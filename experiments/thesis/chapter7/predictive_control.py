@@ -27,7 +27,7 @@ from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 PERIOD, SPEED = 0.01, 1.0  # s, m/s
 LOW_MOVE_WEIGHT, HIGH_MOVE_WEIGHT = 1e-11, 1e-6  # r_w
 TOLERANCE = 1e-4  # relative, of peaks
-CURVE_RESOLUTION = 0.02  # share of a limit at which a drawn curve seems to reach it: fitted
+CURVE_RESOLUTION = 0.02  # of a limit: a drawn curve within it seems to reach the limit; fitted
 # Rigidity (N m^2) and mass per length (kg/m) as printed for beams with patches.
 PRINTED_SECTIONS = ((12.277, 0.7924), (13.211, 0.812), (12.11, 0.5411))
 DAMPING_RATIOS = (0.01, 0.03)
@@ -181,7 +181,7 @@ def _peak_times(record: jb.Record) -> np.ndarray:
 
 
 def _unattainable_reductions(case: jb.Case) -> str:
-    """Why no controller attains the printed reductions of the second half; or empty.
+    """Proof that no controller attains the printed reductions of the second half; or empty.
 
     The stated limits and patches, on beams of every printed rigidity, density and damping ratio,
     and at all speeds of the experiments.

@@ -26,7 +26,7 @@ import numpy as np
 from experiments.benchmarks.common import print_row, print_table
 from experiments.validation.random_cases.checks import ROUNDING, Outcome, check
 
-SHARE = 0.999  # of the cases whose true error is at most the stated one
+FRACTION = 0.999  # of the cases, whose true error is at most the stated one
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 OUT = Path(__file__).parents[3] / "out"
 PAGE = Path(__file__).parents[3] / "docs" / "_static" / "random_cases.md"
@@ -75,7 +75,7 @@ def broken_laws(outcomes: Sequence[Outcome]) -> list[str]:
     lines = [f"case {one.index}: {fault}" for one in outcomes for fault in one.faults]
     above = [one.index for one in outcomes if one.exceeds]
     compared = [one for one in outcomes if one.largest is not None]
-    if len(above) > (1 - SHARE) * len(compared):
+    if len(above) > (1 - FRACTION) * len(compared):
         lines.append(f"the true error exceeds the stated one in cases {', '.join(map(str, above))}")
     return lines
 

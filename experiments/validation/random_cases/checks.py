@@ -74,7 +74,7 @@ def _loads(rng: np.random.Generator) -> list[Load]:
         entry = rng.choice([0.0, 0.0, 0.1, 0.7]) * PERIOD
         if loads and rng.random() < 0.5:
             speed, entry = abs(loads[-1].speed), loads[-1].entry_time
-        stop = rng.choice([np.inf, np.inf, np.inf, 0.3, 0.5, 0.9])  # share of the beam
+        stop = rng.choice([np.inf, np.inf, np.inf, 0.3, 0.5, 0.9])  # fraction of the beam
         loads.append(
             Load(
                 mass=float(10 ** rng.uniform(-3.0, 2.0) * MASS_PER_LENGTH * LENGTH),
@@ -111,7 +111,7 @@ def _case(beam: str, modes: int, damping: float, loads: list[Load], duration: fl
 TIGHT = 1e-10  # tolerance of the run beside which the errors of each case are measured
 ROUNDING = 1e-9  # of the largest deflection; neither scipy nor the tight run are more accurate
 PLACES = np.linspace(0.0, LENGTH, 34)[1:-1]  # m
-SCIPY_SHARE = 0.08  # of the cases that scipy integrates in seconds: 500 of 10 000
+SCIPY_FRACTION = 0.08  # of the cases that scipy integrates in seconds: 500 of 10 000
 MAX_PHASE = 3000.0  # rad; scipy takes seconds for as much of the highest mode, loads on the beam
 SCIPY_LONGEST = 10.0  # s of the processor, of an integration by scipy
 
@@ -233,7 +233,7 @@ def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Reco
 
 def _beside_scipy(seed: int, outcome: Outcome, drawn: Drawn, record: Record) -> Outcome:
     """Outcome of a case with that of scipy, if it is in the sample."""
-    sampled = np.random.default_rng([seed, outcome.index, 1]).random() < SCIPY_SHARE
+    sampled = np.random.default_rng([seed, outcome.index, 1]).random() < SCIPY_FRACTION
     if not sampled or highest_phase(drawn) >= MAX_PHASE:
         return outcome
     try:

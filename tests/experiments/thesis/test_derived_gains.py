@@ -13,7 +13,7 @@ from experiments.thesis.chapter5.fed_back_states import (
     BUT_FOR_THE_END,
     COMBINATIONS,
     FED_BACK,
-    SHARES,
+    FRACTIONS,
     claims,
     identical_gains,
 )
@@ -125,7 +125,7 @@ def test_statements_hold_or_not():
 
 
 def test_difference_of_gains_in_percent_of_the_largest():
-    finite = np.outer(np.ones(SHARES.size), np.arange(1.0, FED_BACK.size + 1))
+    finite = np.outer(np.ones(FRACTIONS.size), np.arange(1.0, FED_BACK.size + 1))
     step = finite.copy()
     step[100, 1] += 0.01  # half a percent of the gain of the second state
     step[-1, 0] = 0.0  # at the end of the crossing
