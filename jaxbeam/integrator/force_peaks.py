@@ -221,7 +221,7 @@ def _forces_on_beam(system, paths: ForcePaths, run, middle):
     return count, force, piece
 
 
-CHUNK_STEPS = 16  # steps of a chunk
+CHUNK_STEPS = 24  # steps of a chunk
 FEW_STEPS = 2  # steps of a chunk that is no longer than these
 REFINEMENTS = 4  # parts into which a step is divided
 MAX_REFINEMENTS = 4  # divisions of a step, one after the other
@@ -300,13 +300,28 @@ class _Search:
             2 * of_forces(error) for error in (responses.table_error, responses.cubic_error)
         )  # errors of a value and of the largest value reached
         self.slack = lines[self.panel]
-        forced = np.stack([self._forced(fraction) for fraction in (0.0, 0.5, 1.0)])
+        # Slow poles are bounded by values and curvature, too, the others by their amplitudes.
         half = (self.length / 2)[:, None]
-        self.bound = product(size, largest) + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
-        self.bound += self.slack
+        turn = (np.abs(self.poles) * half) ** 2 / 8
+        slow = turn < 1
+        now, growing = np.where(slow, self.amplitude, 0.0), np.exp(self.poles * half)
+        largest_value = np.zeros(self.bend.shape)
+        for fraction in (0.0, 0.5, 1.0):
+            forced = self._forced(fraction)
+            if not fraction:
+                self.first = np.abs(forced + self._free(self.amplitude))
+            values = np.abs(forced + self._free(now))
+            np.maximum(largest_value, values, out=largest_value)
+            now = now * growing
+        self.bound = product(size * np.where(slow, turn, 1.0), largest) + largest_value
+        self.bound += forced_bend * half**2 / 8 + self.slack
         self.tables = np.ascontiguousarray(np.moveaxis(responses.table, 2, 0))
         self.tables = self.tables.reshape(self.C.shape[0], -1)
-        self.first = np.abs(forced[0] + product(self.amplitude, self.C.T).real)
+
+    def _free(self, amplitude) -> Float[np.ndarray, "chunk output"]:
+        """Outputs of free vibration with the amplitudes (chunk, pole)."""
+        parts = np.concatenate([amplitude.real, -amplitude.imag], axis=1)
+        return product(parts, np.concatenate([self.C.real.T, self.C.imag.T]))
 
     def _place_forces(self):
         """Set the table positions of forces: `place` at t = 0 (points), `rate` (points/s)."""
