@@ -1,4 +1,4 @@
-"""Writing of programs of JAX as C: arrays, loops over them, and what acts on each entry.
+"""Writing of programs of JAX as C: arrays, loops over them, and elementwise operations.
 
 A program is that of one run; its C computes as many runs at once as a vector register holds. What
 differs between these runs is a `Register` or `Mask` of `native/registers.h` for each number, all
