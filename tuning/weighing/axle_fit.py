@@ -38,7 +38,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
@@ -151,6 +151,9 @@ def dynamic_errors(
     )
 
 
+LEAST_NOISE = 1e-4  # of the deviation of readings, whose resolution is no better
+
+
 def white_noise(
     readings: Float[np.ndarray, "time sensor"], valid: np.ndarray
 ) -> Float[np.ndarray, " sensor"]:
@@ -158,7 +161,7 @@ def white_noise(
     second = np.abs(np.diff(readings, 2, axis=0))
     counted = valid[2:] & valid[1:-1] & valid[:-2]
     levels = [np.median(second[has, s]) if has.any() else 0.0 for s, has in enumerate(counted.T)]
-    return np.maximum(1.4826 * np.array(levels) / np.sqrt(6), 1e-9 * readings.std(axis=0))
+    return np.maximum(1.4826 * np.array(levels) / np.sqrt(6), LEAST_NOISE * readings.std(axis=0))
 
 
 STEPS = 1e-4  # of finite differences, relative to length and duration of the crossing
@@ -292,6 +295,38 @@ class AxleTrain(NamedTuple):
     geometry: AxleGeometry
     forces: Float[np.ndarray, " axle"]
     dynamic_share: float
+
+
+def interpolated(
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+    valid: Bool[np.ndarray, "time sensor"],
+) -> Float[np.ndarray, "time sensor"]:
+    """Readings at times (s) between the valid ones of each sensor; zero of one that has none.
+
+    >>> readings, valid = np.array([[0.0], [9.0], [2.0]]), np.array([[True], [False], [True]])
+    >>> print(interpolated(np.arange(3.0), readings, valid)[1])
+    [1.]
+    """
+    found = np.zeros(readings.shape)
+    for i, has in enumerate(valid.T):
+        if has.any():
+            found[:, i] = np.interp(times, times[has], readings[has, i])
+    return found
+
+
+def telling_sensors(
+    readings: Float[np.ndarray, "time sensor"], valid: Bool[np.ndarray, "time sensor"]
+) -> Bool[np.ndarray, " sensor"]:
+    """Which sensors tell of a crossing: those with valid readings that are not all the same.
+
+    >>> readings = np.array([[0.0, 1.0, 2.0], [0.0, 1.5, 3.0]])
+    >>> valid = np.array([[True, True, False], [True, True, False]])
+    >>> print(telling_sensors(readings, valid))
+    [False  True False]
+    """
+    low, high = (np.where(valid, readings, sign * np.inf) for sign in (1, -1))
+    return high.max(axis=0) > low.min(axis=0)
 
 
 class CrossingLog:

@@ -18,7 +18,7 @@ from jaxbeam.case.loads.axles import Axles
 from jaxbeam.runtime.printer import text_table
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.axle_fit import AxleFit, CrossingLog
+from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.influence_lines import InfluenceLines, lines_for
 from tuning.weighing.matching_pursuit import MosesFit, moses
 from tuning.weighing.search import find_axles, most_likely, with_free_frequency
@@ -159,7 +159,8 @@ def weigh_axles(
     vehicles have them: on a rig of a laboratory use `tuning.identify`.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, a sensor measures velocity
-    or acceleration, the influence lines are of other sensors, or nothing crosses in the log.
+    or acceleration, the influence lines are of other sensors, no sensor has readings that vary, or
+    nothing crosses in the log.
 
     >>> import jaxbeam as jb
     >>> import tuning
@@ -184,7 +185,12 @@ def weigh_axles(
     case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
     lines = lines_for(case, influence_lines)
     readings, valid = sensor_readings(case, log)
-    lines = with_free_frequency(lines, log.times, readings)
+    telling = telling_sensors(readings, valid)
+    if not telling.any():
+        raise ValueError(f"{log.source}: no sensor has valid readings that vary: take another log")
+    readings = interpolated(log.times, readings, valid)[:, telling]
+    valid = valid[:, telling]
+    lines = with_free_frequency(lines.of_sensors(telling), log.times, readings)
     crossing = CrossingLog(log.times, readings, valid)
     fits, tried = find_axles(lines, crossing, speeds, both_ways, axles)
     if not fits:

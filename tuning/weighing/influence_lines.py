@@ -4,7 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
@@ -73,6 +73,11 @@ class InfluenceLines(NamedTuple):
     def length(self) -> float:
         """Length (m) of the beam."""
         return float(self.positions[-1])
+
+    def of_sensors(self, chosen: Bool[np.ndarray, " sensor"]) -> "InfluenceLines":
+        """The lines of some of the sensors."""
+        own = None if self.deviations is None else self.deviations[:, :, chosen]
+        return self._replace(values=self.values[:, chosen], deviations=own)
 
     def crossing(
         self, geometry: AxleGeometry, times: Float[np.ndarray, " time"]

@@ -29,7 +29,7 @@ from tuning.logs.log import Log, LogWarning
 from tuning.logs.pairing import sensor_readings
 from tuning.logs.reading import read_log
 from tuning.modal.preprocessing import with_channels
-from tuning.weighing.axle_fit import AxleFit, CrossingLog
+from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.detectors import LEAST_GAP, axles_of_pulses, pulse_times
 from tuning.weighing.influence_lines import InfluenceLines, lines_for
 from tuning.weighing.search import with_free_frequency
@@ -44,6 +44,7 @@ LEVEL, PASSAGES = 60.0, 12.0
 LONGEST = 20.0  # m, of a vehicle
 AFTER = 2.0  # s of free vibration after a vehicle, from which its frequency is estimated
 BEFORE = 0.6  # s of readings before a vehicle
+LEAST_VALID = 0.5  # of the samples while something is on the bridge
 MAX_LISTED = 20  # vehicles, in the text
 
 
@@ -55,7 +56,8 @@ class TrafficSettings:
     the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
     the channels of two detectors of axles and their positions (m).
 
-    Raises ValueError unless speeds are 0 < low < high, and for another number of detectors.
+    Raises ValueError unless speeds are 0 < low < high, the least weight is a positive number, and
+    detectors are none, or two at two positions.
 
     >>> TrafficSettings((8.0, 35.0)).least_weight
     35000.0
@@ -70,10 +72,16 @@ class TrafficSettings:
         low, high = self.speeds
         if not 0 < low < high:
             raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
-        if len(self.detectors) not in (0, 2) or len(set(self.detectors.values())) == 1:
+        if not 0 < self.least_weight < np.inf:
             raise ValueError(
-                f"there must be two detectors of axles at two positions, or none, not"
-                f" {len(self.detectors)}: a speed is their distance over the time between them"
+                f"the least weight must be a positive number of N, not {self.least_weight:g}"
+            )
+        places = list(self.detectors.values())
+        if places and not (len(set(places)) == len(places) == 2 and np.isfinite(places).all()):
+            listed = ", ".join(f"{name} at {place:g} m" for name, place in self.detectors.items())
+            raise ValueError(
+                "there must be two detectors of axles at two positions, or none; given are"
+                f" {listed}: a speed is their distance over the time between them"
             )
 
 
@@ -308,8 +316,9 @@ def weigh_logs(
     """Table of all vehicles in log files; those in the `store` are not weighed again.
 
     See `weigh_vehicles`, also for `influence_lines`. A line is added to the store, a text file,
-    after each vehicle; logs that have changed are weighed again. `read` reads a log from its file;
-    a bar shows `progress`. Logs that cannot be read are among the problems.
+    after each vehicle; logs that have changed, or whose descriptions have, are weighed again.
+    `read` reads a log from its file; a bar shows `progress`. Logs that cannot be read are among the
+    problems.
 
     Raises FileNotFoundError without the folder of the store, ValueError for a store of another
     case, lines or settings, and as `weigh_vehicles` does.
@@ -334,11 +343,12 @@ def weigh_logs(
     if not store.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
     stored = _Store.opened(store, _mark_of(case, lines, settings))
-    paths, problems = [Path(path) for path in logs], []
+    paths, names, problems = [Path(path) for path in logs], [], []
     kept = keeping(lambda: f"{len(stored.found)} passings are in {store}: go on by the same")
     with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
         for path in paths:
-            name = f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}"
+            name = _version_of(path)
+            names.append(name)
             if name not in stored.whole:
                 try:
                     with warnings.catch_warnings():
@@ -353,7 +363,6 @@ def weigh_logs(
                         stored.add(f"{name} {number}", *record.weighed(one))
                 stored.add(name, [], [], whole=len(record.passings))
             bar.update()
-    names = [f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}" for path in paths]
     parts = [
         stored.found[f"{name} {number}"]
         for name in names
@@ -391,6 +400,7 @@ class _Record(NamedTuple):
             others.remove(channel)
         names = [log.names[i] for i in others]
         readings, valid = sensor_readings(case, with_channels(log, names) if signals else log)
+        readings = interpolated(log.times, readings, valid)
         found = passings(lines, log.times, readings, settings)
         return cls(
             Path(log.source).name, log.start, log.times, readings, valid, signals, lines, settings,
@@ -405,6 +415,9 @@ class _Record(NamedTuple):
             return [], [f"{about}{passing.problem}: not weighed"]
         own = (self.times >= passing.start) & (self.times <= passing.end)
         times, readings, valid = self.times[own], self.readings[own], self.valid[own]
+        telling = telling_sensors(readings, valid)
+        if valid.any(axis=1).mean() < LEAST_VALID or not telling.any():
+            return [], [f"{about}samples are missing while it is on the bridge: not weighed"]
         settings, seen = self.settings, None
         if self.signals:
             apart = LEAST_GAP / settings.speeds[1]
@@ -413,13 +426,15 @@ class _Record(NamedTuple):
             seen = axles_of_pulses(pulses, (first, second), settings.speeds, self.lines.length)
             if not settings.both_ways:
                 seen = [at for at in seen if at.speed > 0]
+        readings, valid = readings[:, telling], valid[:, telling]
         log = CrossingLog(times, readings, valid)
-        lines = with_free_frequency(self.lines, times, readings)
+        lines = with_free_frequency(self.lines.of_sensors(telling), times, readings)
         fits = vehicles_in(
             lines, log, settings.speeds, settings.both_ways, seen, settings.least_weight
         )
         if not fits:
-            return [], [f"{about}no vehicle explains the readings at these speeds: not weighed"]
+            told = "explains the readings" if seen is None else "is told by the detectors"
+            return [], [f"{about}no vehicle {told} at these speeds: not weighed"]
         return [self._vehicle(fit) for fit in fits], []
 
     def _stamp(self, time: float) -> str:
@@ -450,6 +465,13 @@ class _Record(NamedTuple):
         )  # fmt: skip
 
 
+def _version_of(path: Path) -> str:
+    """The name of a log, which changes with its content or its description beside it."""
+    files = [one for one in (path, path.with_suffix(".toml")) if one.is_file()]
+    about = [one.stat() for one in files]
+    return " ".join([path.name, *(f"{one.st_size}-{one.st_mtime_ns}" for one in about)])
+
+
 def _traffic(parts: Iterable[tuple[list[WeighedVehicle], list[str]]]) -> WeighedTraffic:
     """Table of the vehicles and problems found in parts of logs."""
     vehicles: list[WeighedVehicle] = []
@@ -478,7 +500,8 @@ class _Store(NamedTuple):
             with whole_file(path) as partial:
                 partial.write_text(json.dumps({"format": FORMAT, "mark": mark}) + "\n")
             return store
-        head, *entries = read_text_input(path, "store of vehicles").split("\n")
+        text = read_text_input(path, "store of vehicles")
+        head, *entries = text.split("\n")
         content = _entry(head)
         if content.get("format") != FORMAT:
             raise ValueError(f"{path} is no store of vehicles: give another name")
@@ -493,6 +516,9 @@ class _Store(NamedTuple):
             elif "passing" in entry:
                 vehicles = [WeighedVehicle(**one) for one in entry["vehicles"]]
                 store.found[entry["passing"]] = vehicles, entry["problems"]
+        if not text.endswith("\n"):  # so that the next entry begins a line
+            with path.open("a", encoding="utf-8") as file:
+                file.write("\n")
         return store
 
     def add(

@@ -13,8 +13,10 @@ from tests.oracles import planted_trucks
 from tests.tuning.weighing.test_weigh import case_of, log_of
 from tuning import Log
 from tuning.weighing import (
+    InfluenceLines,
     TrafficSettings,
     calibrate_influence_lines,
+    weigh_axles,
     weigh_logs,
     weigh_vehicles,
 )
@@ -137,6 +139,83 @@ def test_pulses_of_vehicles_that_overtake_and_meet():
     assert axles_of_pulses((np.zeros(0), np.ones(1)), (4.0, 16.0), (8.0, 35.0), 20.0) == []
 
 
+def crossed(noise: float) -> tuple[InfluenceLines, Log]:
+    """Lines of moments of a hinged beam, and axles of 60 and 90 kN, 4 m apart, at 20 m/s from 5 s.
+
+    They are superposed, each where it is.
+    """
+    length, places, times = BRIDGE.length, np.array([7.0, 12.0]), np.arange(0.0, 10.0, 0.01)
+
+    def moments(x):
+        x = np.clip(x, 0.0, length)[:, None]
+        return 1e-9 * np.minimum(x * (length - places), places * (length - x)) / length
+
+    readings = 6e4 * moments(20 * (times - 5)) + 9e4 * moments(20 * (times - 5) - 4)
+    readings += noise * np.random.default_rng(3).normal(size=readings.shape)
+    points = np.union1d(np.linspace(0.0, length, 41), places)
+    columns = ("s0", "s1"), ("strain",) * 2, ("1", "1")
+    return InfluenceLines(points, moments(points)), Log(times, readings, *columns)
+
+
+def spoilt(log: Log, how: str) -> Log:
+    """A log with a sensor that is dead or masked, or with masked samples of 1 (no unit)."""
+    values, valid = log.values.copy(), np.ones(log.values.shape, bool)
+    if how == "dead":
+        values[:, 1] = 3e-5
+    elif how == "masked sensor":
+        valid[:, 1] = False
+    elif how == "masked samples":
+        for samples in (slice(100, 110), slice(540, 550)):
+            values[samples], valid[samples] = 1.0, False
+    return dataclasses.replace(log, values=values, valid=valid)
+
+
+@pytest.mark.parametrize("how", ["whole", "dead", "masked sensor", "masked samples"])
+def test_what_sensors_do_not_tell_is_left_out(how):
+    lines, log = crossed(5e-7)
+    found = weigh_vehicles(case_of(BRIDGE), spoilt(log, how), TrafficSettings(SPEEDS), lines)
+    (one,) = found.vehicles
+    assert not found.problems and not one.doubt
+    assert one.gross_weight == pytest.approx(150e3, abs=max(2 * one.gross_half_width, 300.0))
+    np.testing.assert_allclose(one.forces, [6e4, 9e4], rtol=5e-3)
+    assert one.time == pytest.approx(5.0, abs=5e-3)
+    single = weigh_axles(case_of(BRIDGE), spoilt(log, how), SPEEDS, influence_lines=lines)
+    assert single.fit.gross_weight[0] == pytest.approx(150e3, rel=3e-3)
+
+
+def test_readings_without_noise_and_none_that_vary():
+    lines, log = crossed(0.0)
+    (one,) = weigh_vehicles(case_of(BRIDGE), log, TrafficSettings(SPEEDS), lines).vehicles
+    np.testing.assert_allclose(one.forces, [6e4, 9e4], rtol=1e-4)
+    dead = dataclasses.replace(log, values=np.ones((1000, 2)))
+    assert weigh_vehicles(case_of(BRIDGE), dead, TrafficSettings(SPEEDS), lines).problems == ()
+    with pytest.raises(ValueError, match="log: no sensor has valid readings that vary"):
+        weigh_axles(case_of(BRIDGE), dead, SPEEDS, influence_lines=lines)
+    silent = np.hstack([log.values, np.zeros((1000, 2))])
+    columns = ("s0", "s1", "d0", "d1"), ("strain",) * 2 + ("voltage",) * 2, ("1", "1", "V", "V")
+    settings = TrafficSettings(SPEEDS, detectors=DETECTORS)
+    found = weigh_vehicles(case_of(BRIDGE), Log(log.times, silent, *columns), settings, lines)
+    assert "no vehicle is told by the detectors at these speeds" in found.problems[0]
+
+
+def test_logs_of_other_descriptions_are_weighed_again(tmp_path, monkeypatch):
+    lines, log = crossed(5e-7)
+    write(tmp_path / "one.csv", dataclasses.replace(log, names=("s0", "s1")))
+
+    def weighed(*names):
+        files = [tmp_path / name for name in names]
+        settings = TrafficSettings(SPEEDS)
+        return weigh_logs(case_of(BRIDGE), files, tmp_path / "store.jsonl", settings, lines)
+
+    assert weighed("one.csv").vehicles[0].speed == pytest.approx(20.0, rel=1e-3)
+    order = [f"[columns.s{i}]\nsensor = {1 - i}\n" for i in range(2)]
+    (tmp_path / "one.toml").write_text("\n".join(order))
+    monkeypatch.setattr("tuning.weighing.traffic.vehicles_in", lambda *_: [])
+    found = weighed("one.csv", "other.csv")
+    assert found.vehicles == () and "no vehicle explains" in found.problems[0]
+    assert "other.csv" in found.problems[1]
+
+
 def write(path, log: Log, rows=slice(None)):
     heads = [f"{name} [{'1' if name[0] == 's' else 'V'}]" for name in log.names]
     table = np.column_stack([log.times, log.values])[rows]
@@ -157,9 +236,10 @@ def test_a_stopped_weighing_goes_on(lines, tmp_path, monkeypatch):
     check(found.vehicles, trucks, 0.03, 0.15)
     whole = store.read_text()
     head, first, *_ = whole.splitlines()
-    store.write_text("\n".join([head, first, first[:50]]) + "\n")
-    assert weighed().columns["time (s)"].tolist() == found.columns["time (s)"].tolist()
-    assert store.read_text().count('"vehicles"') == 2
+    for broken in ("", "\n"):
+        store.write_text("\n".join([head, first, first[:50]]) + broken)
+        assert weighed().columns["time (s)"].tolist() == found.columns["time (s)"].tolist()
+        assert store.read_text().count('"vehicles"') == 2
     monkeypatch.setattr("tuning.weighing.traffic.vehicles_in", None)
     assert weighed().verdict == found.verdict
     with pytest.raises(ValueError, match="was made with another case, other lines or settings"):
@@ -194,8 +274,12 @@ def test_what_is_passed_over_is_said(lines):
     with pytest.raises(ValueError, match="no channel 'd0' for a detector of axles"):
         settings = TrafficSettings(SPEEDS, detectors=DETECTORS)
         weigh_vehicles(case_of(BRIDGE), only, settings, lines)
-    with pytest.raises(ValueError, match="there must be two detectors of axles at two positions"):
-        TrafficSettings(SPEEDS, detectors={"d0": 4.0})
+    for detectors in ({"d0": 4.0}, {"d0": 4.0, "d1": 4.0}, {"d0": 4.0, "d1": np.nan}):
+        with pytest.raises(ValueError, match="two detectors of axles at two positions.*d0 at 4 m"):
+            TrafficSettings(SPEEDS, detectors=detectors)
+    for weight in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="the least weight must be a positive number of N"):
+            TrafficSettings(SPEEDS, least_weight=weight)
     with pytest.raises(ValueError, match="speeds must be 0 < low < high"):
         TrafficSettings((3.0, 2.0))
 
