@@ -84,14 +84,14 @@ class _Program(NamedTuple):
     """C code of the events of loops of one structure: its arguments, and the parts they share.
 
     `given` flags the `constants` and numbers of a loop that are arguments; `rest` are the parts of
-    a loop that are no numbers, `kinds` shapes and types of its numbers.
+    a loop that are no numbers, `kinds` the places of its numbers, their shapes and types.
     """
 
     text: str
     constants: list[np.ndarray]
     given: list[bool]
     rest: SampledLoop
-    kinds: list[tuple]
+    kinds: list
 
 
 def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
@@ -105,8 +105,8 @@ def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
     for loop in loops:
         numbers, rest = eqx.partition(loop, _is_number)
         numbers, memory = (jax.tree.map(np.asarray, tree) for tree in (numbers, loop.start(1)))
-        leaves, kept = jax.tree.leaves(numbers), jax.tree.leaves(memory)
-        kinds = [(leaf.shape, leaf.dtype) for leaf in leaves]
+        (leaves, places), kept = jax.tree.flatten(numbers), jax.tree.leaves(memory)
+        kinds = [places, *((leaf.shape, leaf.dtype) for leaf in leaves)]
         same = program is not None and kinds == program.kinds
         if not (same and eqx.tree_equal(rest, program.rest) is True):
             program = _program(loop, numbers, rest, memory, kinds)

@@ -84,8 +84,15 @@ def test_loops_of_one_structure_share_their_code():
     for gain in (1.0, 2.0):
         controller = dataclasses.replace(case.controller, gains=gain * case.controller.gains)
         loops.append(loop_of(dataclasses.replace(case, controller=controller)))
+    sensors = case.sensors[:2]  # as many numbers, of other parts
+    for fine in (0, 1):
+        one = [
+            dataclasses.replace(s, resolution=1e-5 if i == fine else None)
+            for i, s in enumerate(sensors)
+        ]
+        loops.append(loop_of(dataclasses.replace(case, sensors=one)))
     together, alone = translated_loops(loops), [translated_loops([loop])[0] for loop in loops]
-    assert len({one.text for one in together}) == 2
+    assert len({one.text for one in together}) == 4
     for one, other in zip(together, alone, strict=True):
         assert one.text == other.text
         assert_array_equal(one.memory, other.memory)
