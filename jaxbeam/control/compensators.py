@@ -240,12 +240,14 @@ class PositivePositionFeedback(AbstractCompensator):
                 f"{words} must have as many rows, one for each further oscillator, of a number for"
                 f" each of {loops} actuators"
             )
-        frequencies, period = self._oscillators()[1], self.period
-        if period is not None and is_concrete(frequencies) and is_concrete(period):
-            highest, nyquist = float(concrete(frequencies).max()), 0.5 / float(concrete(period))
+        for name in ("frequency", "further_frequencies"):
+            given, period = getattr(self, name), self.period
+            if given is None or period is None or not is_concrete(given) or not is_concrete(period):
+                continue
+            highest, nyquist = float(concrete(given).max()), 0.5 / float(concrete(period))
             if highest >= nyquist:
                 return (
-                    f"frequency must be below half the sampling frequency, {nyquist:g} Hz;"
+                    f"{name} must be below half the sampling frequency, {nyquist:g} Hz;"
                     f" it is {highest:g} Hz: lower it, or sample faster"
                 )
         return None

@@ -305,7 +305,11 @@ ERRORS = [
 OSCILLATOR_ERRORS = [
     ({"further_gains": None}, "further_damping_ratios belong together: give all three, or none"),
     ({"further_gains": jnp.ones((1, 1))}, "a number for each of 2 actuators"),
-    ({"further_frequencies": jnp.full((1, 2), 300.0)}, "250 Hz; it is 300 Hz"),
+    (
+        {"further_frequencies": jnp.full((1, 2), 300.0)},
+        "controller.further_frequencies must be below half the sampling frequency, 250 Hz;"
+        " it is 300 Hz",
+    ),
 ]
 
 
