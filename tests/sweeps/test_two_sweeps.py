@@ -163,7 +163,7 @@ def test_killed_overwriting_leaves_the_old_sweep_and_no_lock_that_counts(tmp_pat
     path = tmp_path / "runs.zarr"
     other = jb.sweep(OTHER, OVER, store=path, progress=False)
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
-    while process.poll() is None and not list(tmp_path.glob(".runs.zarr.new/blocks/*/done/c/*")):
+    while process.poll() is None and not list(tmp_path.glob(".runs.zarr.new/blocks/*/*.blocks")):
         time.sleep(0.001)
     process.kill()
     process.wait()
