@@ -31,7 +31,7 @@ from tuning.logs.reading import read_log
 from tuning.modal.preprocessing import with_channels
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.detectors import LEAST_GAP, axles_of_pulses, pulse_times
-from tuning.weighing.influence_lines import InfluenceLines, lines_for
+from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, lines_for
 from tuning.weighing.search import with_free_frequency
 from tuning.weighing.vehicles import MOST_EXCESS, vehicles_in
 
@@ -435,7 +435,8 @@ class _Record(NamedTuple):
         if not fits:
             told = "explains the readings" if seen is None else "is told by the detectors"
             return [], [f"{about}no vehicle {told} at these speeds: not weighed"]
-        return [self._vehicle(fit) for fit in fits], []
+        places = [fit.geometry for fit in fits] if seen is None else []
+        return [self._vehicle(fit, is_beside(fit.geometry, places)) for fit in fits], []
 
     def _stamp(self, time: float) -> str:
         """Date and time, or time of day, of an instant (s) of the log; "" if it has none."""
@@ -446,8 +447,8 @@ class _Record(NamedTuple):
         at = begin + datetime.timedelta(seconds=time - float(self.times[0]))
         return (at if dated else at.time()).isoformat(timespec="milliseconds")
 
-    def _vehicle(self, fit: AxleFit) -> WeighedVehicle:
-        """The vehicle of a fit."""
+    def _vehicle(self, fit: AxleFit, beside: bool) -> WeighedVehicle:
+        """Row of the table for the fit of a vehicle, `beside` another one or not."""
         count, at = fit.forces.size, fit.geometry
         half, (gross, error) = fit.half_widths[:count], fit.gross_weight
         doubt = ""
@@ -457,12 +458,29 @@ class _Record(NamedTuple):
             doubt = "an axle is too light"
         elif gross < self.settings.least_weight:
             doubt = "lighter than what is weighed"
+        elif beside:
+            doubt = "another vehicle is beside it: how their weight is divided is not known"
         share = float(fit.half_widths[0] / fit.errors[0])  # Student's quantile
         return WeighedVehicle(
             self.name, at.entry_time, self._stamp(at.entry_time), at.speed, at.offsets.tolist(),
             fit.forces.tolist(), half.tolist(), gross, share * error,
             [len(group) for group in fit.groups], doubt,
         )  # fmt: skip
+
+
+def is_beside(at: AxleGeometry, vehicles: Sequence[AxleGeometry]) -> bool:
+    """Whether another one of the vehicles, in the same direction, enters while this one enters.
+
+    Then both are side by side, and strains that both cause alike do not tell their weights apart.
+    """
+    begin, end = _entries(at)
+    others = (_entries(one) for one in vehicles if one is not at and one.speed * at.speed > 0)
+    return any(begin <= last and first <= end for first, last in others)
+
+
+def _entries(at: AxleGeometry) -> tuple[float, float]:
+    """Times (s) at which the first and the last axle of a vehicle enter."""
+    return at.entry_time, at.entry_time + float(at.offsets[-1]) / abs(at.speed)
 
 
 def _version_of(path: Path) -> str:

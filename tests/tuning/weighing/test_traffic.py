@@ -21,6 +21,8 @@ from tuning.weighing import (
     weigh_vehicles,
 )
 from tuning.weighing.detectors import axles_of_pulses, pulse_times
+from tuning.weighing.influence_lines import AxleGeometry
+from tuning.weighing.traffic import is_beside
 
 BRIDGE = planted_trucks.BRIDGES[0]
 STEP, SEED, DETECTORS = planted_trucks.STEP * planted_trucks.EVERY, 31, {"d0": 4.0, "d1": 16.0}
@@ -110,6 +112,29 @@ def test_vehicles_one_by_one_are_weighed_by_strain_alone(lines):
     found = weigh_vehicles(case_of(BRIDGE), clock, settings, lines)
     check(found.vehicles, trucks, 0.03, 0.15)
     assert [one.stamp[:5] for one in found.vehicles] == ["23:59", "00:00"]
+
+
+def test_vehicles_side_by_side_are_doubted_without_detectors(lines):
+    """Two trucks in two lanes, 1 m apart: strains do not tell which axle is of which."""
+    log, trucks = logged(((2, 1, 4.0), (3, 1, 4.05)), 8.0)
+    found = weigh_vehicles(case_of(BRIDGE), without_detectors(log), TrafficSettings(SPEEDS), lines)
+    assert found.vehicles and all(one.doubt for one in found.vehicles)
+    together = sum(one.gross_weight for one in found.vehicles)
+    assert together == pytest.approx(sum(truck.loads.sum() for _, truck in trucks), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("speed", "start", "beside"), [(21, 1.3, True), (21, 1.6, False), (-20, 1.0, False)]
+)
+def test_a_vehicle_is_beside_one_that_enters_while_it_enters(speed, start, beside):
+    """One of 10 m at 20 m/s enters for half a second, from 1 s on."""
+    offsets = np.array([0.0, 10.0])
+    one, other = (
+        AxleGeometry(float(v), at, offsets, 30.0) for v, at in ((20, 1.0), (speed, start))
+    )
+    assert is_beside(one, [one, other]) is beside
+    assert is_beside(other, [one, other]) is beside
+    assert not is_beside(one, [one])
 
 
 def test_vehicles_that_meet_are_weighed_by_strain_alone(lines):
