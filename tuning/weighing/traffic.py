@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -310,18 +310,20 @@ def weigh_logs(
     settings: TrafficSettings,
     influence_lines: InfluenceLines | None = None,
     *,
-    read: Callable[[Path], Log] = read_log,
+    columns: Sequence[str] | str | None = None,
+    rate: float | None = None,
+    missing: str = "refuse",
     progress: bool = False,
 ) -> WeighedTraffic:
     """Table of all vehicles in log files; those in the `store` are not weighed again.
 
     See `weigh_vehicles`, also for `influence_lines`. A line is added to the store, a text file,
     after each vehicle; logs that have changed, or whose descriptions have, are weighed again.
-    `read` reads a log from its file; a bar shows `progress`. Logs that cannot be read are among the
-    problems.
+    `columns`, `rate` (Hz) and `missing` are those of `tuning.read_log`; a bar shows `progress`.
+    Logs that cannot be read are among the problems.
 
     Raises FileNotFoundError without the folder of the store, ValueError for a store of another
-    case, lines or settings, and as `weigh_vehicles` does.
+    case, lines, settings or reading, and as `weigh_vehicles` does.
 
     >>> import dataclasses
     >>> from pathlib import Path
@@ -342,7 +344,8 @@ def weigh_logs(
     store, lines = Path(store), lines_for(case, influence_lines)
     if not store.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
-    stored = _Store.opened(store, _mark_of(case, lines, settings))
+    reading: dict[str, Any] = {"columns": columns, "rate": rate, "missing": missing}
+    stored = _Store.opened(store, _mark_of(case, lines, settings, reading))
     paths, names, problems = [Path(path) for path in logs], [], []
     kept = keeping(lambda: f"{len(stored.found)} passings are in {store}: go on by the same")
     with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
@@ -353,7 +356,7 @@ def weigh_logs(
                 try:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", LogWarning)
-                        record = _Record.of(case, lines, read(path), settings)
+                        record = _Record.of(case, lines, read_log(path, **reading), settings)
                 except (ValueError, OSError, ImportError) as error:
                     problems.append(" ".join(str(error).split()))
                     bar.update()
@@ -511,7 +514,8 @@ class _Store(NamedTuple):
     def opened(cls, path: Path, mark: str):
         """Store in a file, which is created if it is missing; a broken last line is dropped.
 
-        Raises ValueError for a file that is no store, or of another case, lines or settings.
+        Raises ValueError for a file that is no store, or of another case, lines, settings or
+        reading.
         """
         store = cls(path, {}, {})
         if not path.exists():
@@ -525,8 +529,8 @@ class _Store(NamedTuple):
             raise ValueError(f"{path} is no store of vehicles: give another name")
         if content.get("mark") != mark:
             raise ValueError(
-                f"{path} was made with another case, other lines or settings: give the same, or"
-                " another store"
+                f"{path} was made with another case, other lines, settings or options of reading:"
+                " give the same, or another store"
             )
         for entry in map(_entry, entries):
             if "whole" in entry:
@@ -562,9 +566,11 @@ def _entry(line: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _mark_of(case: Case, lines: InfluenceLines, settings: TrafficSettings) -> str:
-    """Hash of influence lines, sensor quantities and settings, which identifies a store."""
+def _mark_of(
+    case: Case, lines: InfluenceLines, settings: TrafficSettings, reading: dict[str, Any]
+) -> str:
+    """Hash of influence lines, sensor quantities, settings and how logs are read: of a store."""
     about = dataclasses.asdict(settings) | {"detectors": dict(settings.detectors)}
     sensors = [sensor.quantity for sensor in case.sensors]
-    text = json.dumps([lines.to_dict(), sensors, about])
+    text = json.dumps([lines.to_dict(), sensors, about, reading])
     return hashlib.sha256(text.encode()).hexdigest()[:16]

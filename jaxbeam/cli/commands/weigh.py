@@ -187,8 +187,10 @@ def traffic(
         file for path in logs for file in (logs_in(path, "*", place) if path.is_dir() else [path])
     ]
     found = tuning.weighing.weigh_logs(
-        parsed_case, files, place, settings, lines, read=reading.read, progress=not options.json_
-    )
+        parsed_case, files, place, settings, lines,
+        columns=reading.columns, rate=reading.rate, missing=reading.missing,
+        progress=not options.json_,
+    )  # fmt: skip
     if output is not None:
         write_table(output, found.columns, options.overwrite)
     options.report(found.to_dict(), [str(found)], output, place)

@@ -267,8 +267,11 @@ def test_a_stopped_weighing_goes_on(lines, tmp_path, monkeypatch):
         assert store.read_text().count('"vehicles"') == 2
     monkeypatch.setattr("tuning.weighing.traffic.vehicles_in", None)
     assert weighed().verdict == found.verdict
-    with pytest.raises(ValueError, match="was made with another case, other lines or settings"):
-        weigh_logs(case_of(BRIDGE), [], store, TrafficSettings((5.0, 30.0)), lines)
+    for other, reading in ((TrafficSettings((5.0, 30.0)), {}), (settings, {"missing": "mask"})):
+        with pytest.raises(
+            ValueError, match="was made with another case, other lines, settings or"
+        ):
+            weigh_logs(case_of(BRIDGE), [], store, other, lines, **reading)
     store.write_text("other\n")
     with pytest.raises(ValueError, match="is no store of vehicles: give another name"):
         weighed()
