@@ -323,7 +323,7 @@ def weigh_logs(
     Logs that cannot be read are among the problems.
 
     Raises FileNotFoundError without the folder of the store, ValueError for a store of another
-    case, lines, settings or reading, and as `weigh_vehicles` does.
+    case, lines, settings or reading, if no log can be read, and as `weigh_vehicles` does.
 
     >>> import dataclasses
     >>> from pathlib import Path
@@ -366,6 +366,9 @@ def weigh_logs(
                         stored.add(f"{name} {number}", *record.weighed(one))
                 stored.add(name, [], [], whole=len(record.passings))
             bar.update()
+    if problems and len(problems) == len(paths):
+        several = f"; none of the {len(paths)} logs can be weighed" * (len(paths) > 1)
+        raise ValueError(problems[0] + several)
     parts = [
         stored.found[f"{name} {number}"]
         for name in names

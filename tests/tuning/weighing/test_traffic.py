@@ -272,6 +272,9 @@ def test_a_stopped_weighing_goes_on(lines, tmp_path, monkeypatch):
             ValueError, match="was made with another case, other lines, settings or"
         ):
             weigh_logs(case_of(BRIDGE), [], store, other, lines, **reading)
+    absent = [tmp_path / f"{day}.csv" for day in ("friday", "saturday")]
+    with pytest.raises(ValueError, match="friday.csv.*; none of the 2 logs can be weighed"):
+        weigh_logs(case_of(BRIDGE), absent, store, settings, lines)
     store.write_text("other\n")
     with pytest.raises(ValueError, match="is no store of vehicles: give another name"):
         weighed()
