@@ -255,6 +255,7 @@ BY_THEMSELVES = (
     "jaxbeam.files.export.files",
     "jaxbeam.files.interactive",  # of the package
     "jaxbeam.files.netcdf",
+    "jaxbeam.sweeps.store",  # regular files in the folder of a store
     "tuning.logs.readers.table",
     "tuning.logs.readers.tdms",
 )

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import json
+import os
 import pickle
 import resource
 import shutil
@@ -119,6 +120,14 @@ def test_damaged_blocks_are_computed_again(unfinished, complete, tmp_path, damag
     with pytest.warns(UserWarning, match=sentence) if warns else contextlib.nullcontext():
         found = sweep(path, resume=True)
     xarray.testing.assert_identical(found, complete[1])
+
+
+def test_files_of_blocks_are_regular_ones(unfinished, tmp_path):
+    """A pipe would be waited for without an end; links are refused."""
+    path = tmp_path / "runs.zarr"
+    shutil.copytree(unfinished, path)
+    os.mkfifo(blocks_of(path) / f"{0:032x}.blocks")
+    assert ZarrStore(path).missing(range(3)) == [2]
 
 
 def test_every_changed_byte_of_a_block_is_noticed(tmp_path):
