@@ -310,7 +310,7 @@ class ZarrStore(BlockStore):
 
     def _places(self, blocks: Sequence[int]) -> Iterator[BlockPlace]:
         """Places of some blocks; of one that was computed again there are several."""
-        for file in filter(Path.is_file, sorted(self._folder.glob(f"*{BLOCK_FILES}"))):
+        for file in sorted(self._folder.glob(f"*{BLOCK_FILES}")):
             yield from (place for place in block_places(file) if place.block in blocks)
 
     def _intact(self, blocks: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:

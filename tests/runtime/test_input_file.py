@@ -255,7 +255,7 @@ BY_THEMSELVES = (
     "jaxbeam.files.export.files",
     "jaxbeam.files.interactive",  # of the package
     "jaxbeam.files.netcdf",
-    "jaxbeam.sweeps.store",  # regular files in the folder of a store
+    "jaxbeam.sweeps.store",  # after `check_codecs`
     "tuning.logs.readers.table",
     "tuning.logs.readers.tdms",
 )
