@@ -52,8 +52,8 @@ MAX_LISTED = 20  # vehicles, in the text
 class TrafficSettings:
     """Settings of the search for vehicles in logs.
 
-    `speeds` (m/s) are the lowest and highest ones, in both directions or, without `both_ways`, from
-    the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
+    `speeds` (m/s) are the lowest and highest ones, in both directions or, without `both_ways` and
+    where the sensors do not tell directions, from the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
     the channels of two detectors of axles and their positions (m).
 
     Raises ValueError unless speeds are 0 < low < high, the least weight is a positive number, and
@@ -298,8 +298,11 @@ def weigh_vehicles(
     >>> print(f"{found.gross_weight / 1e3:.0f} kN, class {found.silhouette}")
     100 kN, class 1
     """
-    record = _Record.of(case, lines_for(case, influence_lines), log, settings)
-    return _traffic([record.weighed(one) for one in record.passings])
+    lines = lines_for(case, influence_lines)
+    settings, remarks = _with_directions(lines, settings)
+    record = _Record.of(case, lines, log, settings)
+    found = _traffic([record.weighed(one) for one in record.passings])
+    return dataclasses.replace(found, problems=(*found.problems, *remarks))
 
 
 @refuses_traced("a weighing")
@@ -331,7 +334,7 @@ def weigh_logs(
     >>> import tuning
     >>> beam, load = jb.Beam(20.0, 8e9, 12e3, 0.02), jb.MovingForce(force=1e5, speed=20.0)
     >>> load = dataclasses.replace(load, entry_time=2.0)
-    >>> case = jb.Case(beam, sensors=[jb.Sensor(10.0)], loads=[load], run=jb.Run(6.0, 50.0))
+    >>> case = jb.Case(beam, sensors=[jb.Sensor(8.0)], loads=[load], run=jb.Run(6.0, 50.0))
     >>> record = jb.simulate(case)
     >>> rows = zip(record.times, record.deflection[:, 0])
     >>> text = "\\n".join(["t [s],w [m]", *(f"{t:.2f},{w:.4e}" for t, w in rows)])
@@ -346,6 +349,7 @@ def weigh_logs(
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
     reading: dict[str, Any] = {"columns": columns, "rate": rate, "missing": missing}
     stored = _Store.opened(store, _mark_of(case, lines, settings, reading))
+    settings, remarks = _with_directions(lines, settings)
     paths, names, problems = [Path(path) for path in logs], [], []
     kept = keeping(lambda: f"{len(stored.found)} passings are in {store}: go on by the same")
     with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
@@ -375,7 +379,25 @@ def weigh_logs(
         for number in range(stored.whole.get(name, 0))
     ]
     found = _traffic(parts)
-    return dataclasses.replace(found, problems=(*found.problems, *problems))
+    return dataclasses.replace(found, problems=(*found.problems, *problems, *remarks))
+
+
+SYMMETRY = 0.01  # of a line's largest value, by which it differs from its mirror image
+
+
+def _with_directions(
+    lines: InfluenceLines, settings: TrafficSettings
+) -> tuple[TrafficSettings, list[str]]:
+    """Settings with vehicles from the left alone if readings do not tell directions; why, if so."""
+    mirrored = lines.at(lines.length - lines.positions)
+    differences = np.abs(lines.values - mirrored).max(axis=0)
+    told = np.any(differences > SYMMETRY * np.abs(lines.values).max(axis=0))
+    if settings.detectors or not settings.both_ways or told:
+        return settings, []
+    return dataclasses.replace(settings, both_ways=False), [
+        "the sensors read the same of vehicles from either end, all of which are listed as from the"
+        " left: put a sensor off the middle of the beam, or give detectors"
+    ]
 
 
 class _Record(NamedTuple):

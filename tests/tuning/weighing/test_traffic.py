@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+import jaxbeam as jb
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import save_case
 from tests.oracles import planted_trucks
@@ -135,6 +136,23 @@ def test_a_vehicle_is_beside_one_that_enters_while_it_enters(speed, start, besid
     assert is_beside(one, [one, other]) is beside
     assert is_beside(other, [one, other]) is beside
     assert not is_beside(one, [one])
+
+
+@pytest.mark.parametrize(("middle", "told"), [(5.0, False), (4.0, True)])
+def test_directions_are_told_by_lines_without_symmetry(middle, told):
+    """A truck from the right, by the triangular line of one sensor and noise of 1 %."""
+    lines = InfluenceLines(np.array([0.0, middle, 10.0]), np.array([[0.0], [-1e-8], [0.0]]))
+    times = np.arange(600) / 100
+    travelled = 20.0 * (times - 3.0)
+    readings = 5e4 * lines.at(10.0 - travelled) + 8e4 * lines.at(13.5 - travelled)
+    readings += 1e-5 * np.random.default_rng(1).normal(size=readings.shape)
+    case = jb.Case(jb.Beam(10.0, 1e9, 1e3), sensors=[jb.Sensor(middle)], run=jb.Run(6.0, 100.0))
+    log = Log(times, readings, ("w",), ("deflection",), ("m",), "monday", (0,))
+    found = weigh_vehicles(case, log, TrafficSettings((10.0, 30.0)), lines)
+    assert [one.speed > 0 for one in found.vehicles] == [not told]
+    assert found.vehicles[0].gross_weight == pytest.approx(130e3, rel=0.02)
+    remark = "the sensors read the same of vehicles from either end"
+    assert any(remark in one for one in found.problems) is not told
 
 
 def test_vehicles_that_meet_are_weighed_by_strain_alone(lines):
