@@ -53,8 +53,9 @@ class TrafficSettings:
     """Settings of the search for vehicles in logs.
 
     `speeds` (m/s) are the lowest and highest ones, in both directions or, without `both_ways` and
-    where the sensors do not tell directions, from the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
-    the channels of two detectors of axles and their positions (m).
+    where the sensors do not tell directions, from the left only; vehicles lighter than the
+    `least_weight` (N) may be passed over. `detectors` are the channels of two detectors of axles
+    and their positions (m).
 
     Raises ValueError unless speeds are 0 < low < high, the least weight is a positive number, and
     detectors are none, or two at two positions.
