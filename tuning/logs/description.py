@@ -94,6 +94,12 @@ def read_description(log: Path) -> LogDescription:
         raise ValueError(f"{path}: {error}") from None
 
 
+def version_of(log: Path) -> str:
+    """Sizes (bytes) and times of change (ns) of a log and its description, noted in stores."""
+    about = (path.stat() for path in (log, log.with_suffix(".toml")) if path.is_file())
+    return " ".join(f"{one.st_size}-{one.st_mtime_ns}" for one in about)
+
+
 def _description(data: dict[str, Any]) -> LogDescription:
     """Description from the tables of its file."""
     check_table("", data, _KEYS)

@@ -19,6 +19,7 @@ from jaxbeam.runtime.input_file import read_text_input
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.progress import ProgressBar
+from tuning.logs.description import version_of
 from tuning.logs.log import LogWarning
 from tuning.logs.reading import read_log
 from tuning.modal.arguments import ModalSettings
@@ -160,7 +161,7 @@ def analyse(
                 " same, or another store"
             )
         known = {entry.file: entry for entry in former.entries}
-    marks = {path.name: _mark(path) for path in files}
+    marks = {path.name: version_of(path) for path in files}
     known = {name: one for name, one in known.items() if marks.get(name) == one.mark}
     left = [path for path in files if path.name not in known]
     kept = keeping(lambda: f"{len(known)} of {len(files)} logs are in {store}: go on by the same")
@@ -187,11 +188,6 @@ def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
     if not found:
         raise FileNotFoundError(f"there is no log in {folder} that matches {pattern!r}")
     return found
-
-
-def _mark(path: Path) -> str:
-    about = path.stat()
-    return f"{about.st_size}-{about.st_mtime_ns}"
 
 
 def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> ModeHistory:
@@ -227,7 +223,7 @@ def _analysed(
 
 def entry_of(path: Path, settings: AnalysisSettings) -> LogModes:
     """LogModes of one log."""
-    mark = _mark(path)
+    mark = version_of(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LogWarning)

@@ -25,6 +25,7 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.runtime.progress import ProgressBar
+from tuning.logs.description import version_of
 from tuning.logs.log import Log, LogWarning
 from tuning.logs.pairing import sensor_readings
 from tuning.logs.reading import read_log
@@ -355,7 +356,7 @@ def weigh_logs(
     kept = keeping(lambda: f"{len(stored.found)} passings are in {store}: go on by the same")
     with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
         for path in paths:
-            name = _version_of(path)
+            name = f"{path.name} {version_of(path)}"
             names.append(name)
             if name not in stored.whole:
                 try:
@@ -510,13 +511,6 @@ def is_beside(at: AxleGeometry, vehicles: Sequence[AxleGeometry]) -> bool:
 def _entries(at: AxleGeometry) -> tuple[float, float]:
     """Times (s) at which the first and the last axle of a vehicle enter."""
     return at.entry_time, at.entry_time + float(at.offsets[-1]) / abs(at.speed)
-
-
-def _version_of(path: Path) -> str:
-    """The name of a log, which changes with its content or its description beside it."""
-    files = [one for one in (path, path.with_suffix(".toml")) if one.is_file()]
-    about = [one.stat() for one in files]
-    return " ".join([path.name, *(f"{one.st_size}-{one.st_mtime_ns}" for one in about)])
 
 
 def _traffic(parts: Iterable[tuple[list[WeighedVehicle], list[str]]]) -> WeighedTraffic:

@@ -162,6 +162,11 @@ def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
 
     monkeypatch.setattr("tuning.monitoring.history.entry_of", refuse)
     assert analyse(logs, store, AnalysisSettings(band=(1.0, 10.0))).entries[-1].file == "log4.csv"
+    description = logs / "log2.toml"
+    description.write_text("rate = 50\n")
+    with pytest.raises(AssertionError, match="a log was analysed again"):
+        analyse(logs, store, AnalysisSettings(band=(1.0, 10.0)))
+    description.unlink()
     with pytest.raises(ValueError, match="was made with another band"):
         analyse(logs, store, AnalysisSettings(band=(1.0, 12.0)))
     with pytest.raises(FileNotFoundError, match="no log in .* that matches 'none"):
