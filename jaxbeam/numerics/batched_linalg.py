@@ -147,15 +147,6 @@ def _(count, batched, *systems):
     return xp.moveaxis(_gauss_jordan(*systems), -1, 0), True
 
 
-def matmul_last(
-    a: Float[Array, "row term batch"], b: Float[Array, "term column batch"]
-) -> Float[Array, "row column batch"]:
-    """Products of matrices, batch axis last, unrolled where the sums are short and traced."""
-    if 0 < a.shape[1] <= MAX_UNROLLED_TERMS and any_jax(a, b):
-        return _unrolled_matmul(a, b)
-    return xp.einsum("ijb,jkb->ikb", a, b)
-
-
 def matmul(
     a: Float[Array, "row term _"], b: Float[Array, "term column _"]
 ) -> Float[Array, "row column batch"]:
