@@ -8,6 +8,9 @@ from typing import Any
 
 from tqdm import tqdm
 
+# "512/512 runs [00:01<00:00]", and "8 points [00:10]" of work of unknown length.
+KNOWN_LENGTH = "{l_bar}{bar}| {n_fmt}/{total_fmt} {unit}s [{elapsed}<{remaining}{postfix}]"
+UNKNOWN_LENGTH = "{desc}: {n_fmt} {unit}s [{elapsed}{postfix}]"
 # Called with the steps done, those of the whole, and what a step is; what it raises ends the work.
 OnStep = Callable[[int, int, str], None]
 _ON_STEP: contextvars.ContextVar[OnStep | None] = contextvars.ContextVar("on_step", default=None)
@@ -24,7 +27,14 @@ class ProgressBar(tqdm):
     """
 
     def __init__(self, total: int | None, unit: str, *, shown: bool, **options: Any):
-        super().__init__(total=total, unit=unit, disable=not shown, file=sys.stderr, **options)
+        super().__init__(
+            total=total,
+            unit=unit,
+            disable=not shown,
+            file=sys.stderr,
+            bar_format=UNKNOWN_LENGTH if total is None else KNOWN_LENGTH,
+            **options,
+        )
         self._done = options.get("initial", 0)
         self._words = unit
         self._tell()
