@@ -10,7 +10,7 @@ from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.fields import OUTSIDE, refuses_traced
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.files.case_file import with_settings
-from jaxbeam.model.plausibility.check import warn_if_implausible
+from jaxbeam.model.plausibility.check import warn_if_implausible_sweep
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import TOLERANCE
@@ -121,8 +121,7 @@ def sweep(
         plan = word_sweep(case, words, numbers, list(over), *settings)
     else:
         plan = sweep_specification(case, over, *settings)
-    for one in (case, *first_and_last(case, over)):
-        warn_if_implausible(one)
+    warn_if_implausible_sweep([case, *first_and_last(case, over)], over)
     warn_of_truncation(case)
     compute = compute_word_sweep if words else compute_sweep
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict, with_settings
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.plausibility.check import PlausibilityWarning
 from tests.modules import ROOT
@@ -796,6 +796,27 @@ def test_a_sweep_is_judged_at_its_ends():
     case = bridge()
     with pytest.warns(PlausibilityWarning, match=r"loads.0.speed: 200 m/s is 720 km/h"):
         jb.sweep(case, {"loads.0.speed": [20.0, 200.0]}, progress=False)
+
+
+def test_a_sweep_is_not_judged_by_a_part_that_suits_other_runs():
+    """A point force of 46 N bends too far beside the lightest mass, not beside the heaviest."""
+    beam = jb.Beam(0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    case = jb.Case(
+        beam,
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+        actuators=[jb.PointForce(0.3, limits=(-46.0, 46.0))],
+        run=jb.Run(0.5),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", PlausibilityWarning)
+        jb.sweep(case, {"loads.0.mass": [0.05, 0.5]}, progress=False)
+    with pytest.warns(PlausibilityWarning, match="actuators.0.* times as far as its loads do"):
+        jb.sweep(
+            with_settings(case, {"loads.0.mass": 0.02}),
+            {"loads.*.mass": [0.01, 0.03]},
+            progress=False,
+        )
 
 
 def test_traced_numbers_are_not_judged():

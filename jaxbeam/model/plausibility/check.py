@@ -7,9 +7,11 @@ t. What follows from them (first frequency, static deflection, mass ratio, criti
 import collections
 import contextvars
 import dataclasses
+import itertools
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
+from fnmatch import fnmatch
 
 import jax
 import numpy as np
@@ -73,11 +75,34 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
     signs and powers of two of a recent one without warnings is not checked again, so that a loop
     over runs does not pay for it.
     """
+    for sentence in _warnings_of(case, found) or ():
+        warnings.warn(sentence, PlausibilityWarning, stacklevel=1)
+
+
+def warn_if_implausible_sweep(cases: Sequence[Case], swept: Collection[str]) -> None:
+    """Warn of implausible numbers of a sweep, whose extreme `cases` are given.
+
+    A number outside the parts with `swept` addresses is warned of if it is implausible in all
+    cases: an actuator may be too strong for the lightest load and right for the heaviest.
+    """
+    found = [sentences for case in cases if (sentences := _warnings_of(case)) is not None]
+    by_address: dict[str, list[str]] = {}
+    for sentence in itertools.chain.from_iterable(found):
+        by_address.setdefault(sentence.partition(": ")[0], []).append(sentence)
+    swept_parts = {_part(address) or address.partition(".")[0] for address in swept}
+    for address, sentences in by_address.items():
+        part = _part(address) or address.partition(".")[0]
+        if len(sentences) >= len(found) or any(fnmatch(part, one) for one in swept_parts):
+            warnings.warn(sentences[0], PlausibilityWarning, stacklevel=1)
+
+
+def _warnings_of(case: Case, found: Modes | None = None) -> tuple[str, ...] | None:
+    """Warnings of a case; None if they are left to the caller, or the case is traced or invalid."""
     if _SHOWN.get() or not all_concrete(case):
-        return
+        return None
     sizes = _sizes(case)
     if sizes in _PLAUSIBLE:
-        return
+        return ()
     try:
         if found is None:
             check_case(case)
@@ -85,11 +110,10 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
             found = jax.tree.map(concrete, found)
         sentences = _checked(concrete_case(case), found).warnings
     except (ValueError, np.linalg.LinAlgError, jax.errors.ConcretizationTypeError):
-        return
-    for sentence in sentences:
-        warnings.warn(sentence, PlausibilityWarning, stacklevel=1)
+        return None
     if not sentences:
         _PLAUSIBLE.append(sizes)
+    return sentences
 
 
 def leave_warnings_to_caller() -> None:
