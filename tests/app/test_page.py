@@ -291,6 +291,15 @@ def test_a_map_fills_and_a_cell_opens_its_run(page):
     assert 'speed = "3.6 km/h"' in text_of(page)
 
 
+def test_what_a_panel_said_ends_with_it_and_rounding_is_zero(page):
+    page.get_by_role("tab", name="Sweep").click()
+    page.get_by_role("button", name="Sweep", exact=True).click()
+    wait_for(lambda: "choose an address" in page.locator("#status").inner_text())
+    page.get_by_role("tab", name="Histories").click()
+    wait_for(lambda: page.locator("#status").inner_text() == "")
+    assert page.locator(".plot .readout").first.inner_text().split()[:2] == ["0:", "0"]
+
+
 def test_a_log_is_dropped_and_shown_as_read(page, server):
     log = server.path.parent / "log.csv"
     log.write_text("time [s],w1 [mm]\n" + "".join(f"{i / 100},{i % 7}\n" for i in range(50)))

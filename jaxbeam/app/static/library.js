@@ -6,6 +6,9 @@ import { drawVehicle } from "./vehicle.js";
 
 const WIDTH = 200, HEIGHT = 56, WHEEL = 7;
 
+/** @param {number} count */
+const axles = (count) => `${count} ${count === 1 ? "axle" : "axles"}`;
+
 /** @param {import("./store.js").Store} store */
 export function createLibrary(store) {
   const dialog = /** @type {HTMLDialogElement} */ (document.getElementById("library"));
@@ -63,8 +66,8 @@ export function createLibrary(store) {
       store.change({ set: "loads.0", to: { ...load, speed: Math.round(store.scene?.length ?? 10), ...Object.fromEntries(moving) } });
     };
     open("Let it cross", {
-      Vehicles: found.vehicles.map((/** @type {any} */ one) => card(one.name, `${one.vehicle.wheels} axles, ${number(one.mass / 1000, 3)} t`, () => cross({ kind: "vehicle", model: one.name }), vehiclePicture(one.vehicle, one.positions))),
-      Trains: found.trains.map((/** @type {any} */ one) => card(one.name, `${one.offsets.length} axles, ${number(Math.max(...one.offsets), 3)} m`, () => cross({ kind: "axles", train: one.name }), trainPicture(one.offsets))),
+      Vehicles: found.vehicles.map((/** @type {any} */ one) => card(one.name, `${axles(one.vehicle.wheels)}, ${number(one.mass / 1000, 3)} t`, () => cross({ kind: "vehicle", model: one.name }), vehiclePicture(one.vehicle, one.positions))),
+      Trains: found.trains.map((/** @type {any} */ one) => card(one.name, `${axles(one.offsets.length)}, ${number(Math.max(...one.offsets), 3)} m`, () => cross({ kind: "axles", train: one.name }), trainPicture(one.offsets))),
     });
   }
 

@@ -94,6 +94,7 @@ function bar() {
   [undo.disabled, redo.disabled] = [!store.canUndo, !store.canRedo];
 }
 let ofModel = "";
+results.list.addEventListener("click", () => store.say(ofModel, true)); // no longer what another panel has said
 store.on("text", bar);
 store.on("model", () => {
   bar();

@@ -194,8 +194,9 @@ export class Plot {
       const [left, right] = [Math.max(g.X(from), MARGIN.left), Math.min(g.X(to), MARGIN.left + g.inner.width)];
       if (right > left) c.fillRect(left, MARGIN.top, right - left, g.inner.height);
     }
-    const [factor, unit] = scaled(Math.max(Math.abs(g.low), Math.abs(g.high)), this.options.unit);
-    this.scale = { factor, unit };
+    const largest = Math.max(Math.abs(g.low), Math.abs(g.high));
+    const [factor, unit] = scaled(largest, this.options.unit);
+    this.scale = { factor, unit, rounding: 1e-9 * largest };
     c.lineWidth = 1;
     c.fillStyle = tint("quiet");
     c.textAlign = "right";
@@ -249,8 +250,9 @@ export class Plot {
     const at = this.#hover ?? this.#cursor;
     if (!Number.isFinite(at) || !series.length || !x.length) return;
     const i = indexAt(x, at);
-    const { factor, unit } = this.scale ?? { factor: 1, unit: "" };
-    const values = series.slice(0, 6).map((one) => (series.length > 1 ? `${one.name} ` : "") + `${number(one.y[i] / factor)} ${unit}`);
+    const { factor, unit, rounding } = this.scale ?? { factor: 1, unit: "", rounding: 0 };
+    const text = (/** @type {number} */ y) => `${number(Math.abs(y) < rounding ? 0 : y / factor)} ${unit}`;
+    const values = series.slice(0, 6).map((one) => (series.length > 1 ? `${one.name} ` : "") + text(one.y[i]));
     const near = events.find((one) => Math.abs(one.x - at) < 0.01 * (this.#domain[1] - this.#domain[0]));
     this.readout.textContent = `${number(x[i])}: ${values.join(", ")}${near ? `; ${near.name}` : ""}`;
   }
