@@ -130,9 +130,9 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
     `beam` (frame, x) is the deflection (m) at `x` (m) and `frameTimes` (s), `wheelPositions`
     (frame, wheel) and `bodies` (frame, dof) are those of the loads; `sensors` (time, sensor),
-    `contact` (time, wheel) of the first wheels, `strokes` (time, absorber) and `commands` (time,
-    actuator) are histories over `times`, in SI units. Only so many samples as a screen can show are
-    among them.
+    `contact` (time, wheel) of the first wheels whose force follows from the motion, `strokes`
+    (time, absorber) and `commands` (time, actuator) are histories over `times`, in SI units. Only
+    so many samples as a screen can show are among them.
     """
     case, loads = record.case, record.loads
     frames = _spread(record.times.size, MAX_FRAMES)
@@ -142,7 +142,8 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     lost = np.asarray(record.contact_lost_time), np.asarray(record.contact_lost_position)
     diverged = float(record.diverged_time)
     wheels = [w for w, load in enumerate(loads.load_of_wheel) if load < len(case.loads)]
-    shown = wheels[:MAX_WHEELS]
+    moved = [w for w in wheels if not loads.prescribed[w]]
+    shown = moved[:MAX_WHEELS]
     words = {
         "verdict": record.verdict,
         "steps": int(record.steps),
@@ -150,6 +151,7 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "wheels": wheel_labels(loads).tolist(),
         "bodies": record.bodies,
         "shownWheels": shown,
+        "hiddenWheels": len(moved) - len(shown),
         "lost": [
             {"wheel": int(i), "time": float(lost[0][i]), "position": float(lost[1][i])}
             for i in np.flatnonzero(np.isfinite(lost[0]))

@@ -172,6 +172,23 @@ def test_absorbers_are_parts_that_swing_and_no_wheels_of_loads(workspace):
     np.testing.assert_allclose(swing, record.stroke[frames, 0], atol=1e-12)
 
 
+FOLLOWING_TRUCK = (
+    '\n[[loads]]\nkind = "vehicle"\nmodel = "truck-5-axle"\nspeed = 20.0\nentry_time = 1.0\n'
+)
+
+
+def test_contact_forces_that_are_given_have_no_history(workspace):
+    """Of a train of constant forces none; of three trucks the first twelve wheels of fifteen."""
+    bridge = (ROOT / "examples/road_bridge/case.toml").read_text(encoding="utf-8")
+    words, _ = views.pictures(workspace.record(f"{bridge}{2 * FOLLOWING_TRUCK}"))
+    assert (len(words["shownWheels"]), words["hiddenWheels"]) == (12, 3)
+    train = bridge.replace('kind = "vehicle"', 'kind = "axles"')
+    words, arrays = views.pictures(
+        workspace.record(train.replace('model = "truck-5-axle"', 'train = "HSLM-A1"'))
+    )
+    assert words["shownWheels"] == [] and arrays["contact"].shape[1] == 0
+
+
 # Changes of the text of a case: what is not changed stays as it was.
 
 CASES = sorted(

@@ -36,7 +36,8 @@ export function createHistories(store) {
     }
     if (contact.shape[1]) {
       const series = run.shownWheels.map((/** @type {number} */ wheel, /** @type {number} */ i) => ({ name: `load ${run.wheels[wheel]}`, tint: i, y: column(contact, i) }));
-      wanted.push({ title: "Contact force", unit: "N", content: { x, series, spans, events } });
+      const title = run.hiddenWheels ? `Contact force, first ${series.length} of ${series.length + run.hiddenWheels} wheels` : "Contact force";
+      wanted.push({ title, unit: "N", content: { x, series, spans, events } });
     }
     if (strokes.shape[1]) {
       const series = Array.from({ length: strokes.shape[1] }, (_, i) => ({ name: `absorber ${i}`, tint: i, y: column(strokes, i) }));
