@@ -78,10 +78,8 @@ def report(record: "jb.Record") -> str:
         ],
     )
     forces = zip(content["lowest_contact_force"], content["largest_contact_force"], strict=True)
-    wheels = ReportTable(
-        ("wheel", "lowest contact force (N)", "largest (N)"),
-        [(str(i), number(low), number(high)) for i, (low, high) in enumerate(forces)],
-    )
+    rows = [(str(i), number(low), number(high)) for i, (low, high) in enumerate(forces)]
+    wheels = ReportTable(("wheel", "lowest contact force (N)", "largest (N)"), rows)
     parts = case_to_dict(record.case)
     entries = [(key, _short(value)) for key, value in parts.items() if key != "title"]
     picture = ReportFigure("histories of the run", plot_record(record), embedded=True)
@@ -90,7 +88,7 @@ def report(record: "jb.Record") -> str:
         [
             ReportSection("", [content["verdict"]]),
             ReportSection("Sensors", [sensors, picture]),
-            ReportSection("Wheels", [wheels]),
+            *([ReportSection("Wheels", [wheels])] if rows else []),
             ReportSection("Case (SI units)", [ReportTable(("part", "numbers"), entries)]),
             ReportSection("", [f"jaxbeam {jb.__version__}"]),
         ],

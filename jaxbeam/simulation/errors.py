@@ -58,7 +58,8 @@ def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, 
     index, every = own_outputs(sensors), slice(0, len(sensors))
     if np.array_equal(index, np.arange(len(sensors))):
         index = every  # a slice, for which programs are smaller
-    extremes = Extremes(-down[index], down_time[index], up[index], up_time[index])
+    smallest = 0.0 - down[index]  # of a beam at rest 0, not -0
+    extremes = Extremes(smallest, down_time[index], up[index], up_time[index])
     is_up = up[every] >= down[every]
     deflection = xp.where(is_up, up[every], down[every])
     time = xp.where(is_up, up_time[every], down_time[every])

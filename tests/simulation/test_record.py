@@ -243,6 +243,8 @@ def test_record_without_loads_and_sensors(tmp_path):
     record = jb.simulate(case)
     assert record.deflection.shape == (101, 0) and record.contact_force.shape == (101, 0)
     assert not np.any(record.coordinates)
+    measured = jb.simulate(dataclasses.replace(case, sensors=(jb.Sensor(0.5),)))
+    assert not np.signbit(measured.extremes.smallest[0])  # printed as 0, not -0
     record.to_netcdf(tmp_path / "nothing.nc")
     assert_same(jb.read_record(tmp_path / "nothing.nc"), record)
 
