@@ -18,7 +18,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.output_rows import LinearOutputs
 from jaxbeam.model.sensing.sensor_signals import VehicleMotion
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, add_at, xp
 
 
 def outputs_of_forces(
@@ -81,21 +81,27 @@ def motion_of(
     actuators = len(case.actuators)
     command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
     motion = Motion(coordinates, rates, accelerations, position, -force, command)
-    return motion, _with_absorbers(case, model, motion, vehicles)
+    return motion, _with_absorbers(case, model, loads, motion, vehicles)
 
 
 def _with_absorbers(
-    case: Case, model: ModalModel, motion: Motion, vehicles: VehicleMotion
+    case: Case, model: ModalModel, loads: LoadSet, motion: Motion, vehicles: VehicleMotion
 ) -> VehicleMotion:
     """Motion of the bodies, with absorbers themselves in place of their equivalent oscillators.
 
-    u = r z + (1 - r) y; see `jaxbeam.case.absorbers`.
+    u = r z + (1 - r) y; see `jaxbeam.case.absorbers`. The oscillators stand on the profile, whose
+    height is none of the absorbers', as these hang on the beam.
     """
     if not case.absorbers:
         return vehicles
     shapes = model.modes.shapes(xp.stack([one.position for one in case.absorbers]))
     fraction = xp.stack([one.body_fraction for one in case.absorbers])
     count, moved = len(case.absorbers), []
+    places = loads.kinematics(np.zeros(()))[0][-count:]
+    surface = loads.surface_motion(places, *2 * (xp.zeros(count),))
+    if surface is not None:
+        displacement = add_at(vehicles.body_displacement, np.s_[:, -count:], -surface[0])
+        vehicles = vehicles._replace(body_displacement=displacement)
     of_modes = motion.coordinates, motion.rates, motion.accelerations
     for equivalent, modal in zip(vehicles, of_modes, strict=True):
         own = fraction * equivalent[:, -count:] + (1 - fraction) * (modal @ shapes.T)

@@ -135,6 +135,20 @@ def test_inerters_against_their_equations():
     assert record.bodies == [f"absorbers.{i} body" for i in range(3)]
 
 
+def test_the_road_is_not_under_what_hangs_on_the_beam():
+    case = jb.Case(
+        dataclasses.replace(BRIDGE, modes=3),
+        sensors=[jb.Sensor(12.5)],
+        loads=[jb.MovingForce(force=2e5, speed=40.0)],  # whose force no road changes
+        absorbers=[jb.Absorber(9.0, mass=2e3, stiffness=1e6, damping=9e3, inertance=500.0)],
+        run=jb.Run(1.0, sample_rate=200.0),
+    )
+    road = jb.profiles.SineProfile(amplitude=0.01, wavelength=7.0)
+    level, rough = (jb.simulate(dataclasses.replace(case, profile=r)) for r in (None, road))
+    assert rough.stroke == pytest.approx(level.stroke, abs=1e-12)
+    assert rough.body_displacement == pytest.approx(level.body_displacement, abs=1e-12)
+
+
 def test_receptance_with_absorbers():
     absorber = jb.Absorber(
         11.0,
