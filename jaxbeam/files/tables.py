@@ -262,6 +262,10 @@ def sweep_columns(dataset: "xarray.Dataset") -> dict[str, np.ndarray]:
         words = f"{name} peak {sensor.quantity}"
         columns[words + _in_brackets(sensor.unit)] = of_runs(_entry(dataset[peak], "sensor", i))
         columns[f"time of {words} (s)"] = of_runs(_entry(dataset[time], "sensor", i))
+    for i in range(dataset.sizes.get("absorber", 0)):
+        for words, name in (("stroke (m)", "peak_stroke"), ("force (N)", "peak_absorber_force")):
+            peaks = of_runs(dataset[name].isel(absorber=i))
+            columns[f"absorber {i} peak {words}"] = peaks
     forces = dataset.get("lowest_contact_force", None)
     if forces is not None and "load" in forces.dims and 0 < forces.sizes["load"] <= MAX_LOADS:
         for i in range(forces.sizes["load"]):

@@ -170,7 +170,8 @@ class DiscreteModel(Module):
     the energies of the blocks (see `bounds_by_energy`). With `with_node_states`, step matrices
     include the states at the nodes. `load_influence` is the direct influence of forces on outputs
     with a static correction. Peaks are those of the `magnitude` of an output, by default its
-    absolute value.
+    absolute value. The last outputs are deflections at the `absorbers`, given twice, in place of
+    which peaks are those of their strokes (m) and then forces (N).
     """
 
     model: ModalModel
@@ -183,6 +184,7 @@ class DiscreteModel(Module):
     with_node_states: bool = eqx.field(static=True)
     load_influence: LoadInfluence | None = None
     magnitude: Callable = eqx.field(static=True, default=abs)
+    absorbers: int = eqx.field(static=True, default=0)
 
     @property
     def position_count(self) -> int:

@@ -9,6 +9,7 @@ advances the states (`step`), and peaks are updated for the chunk at once (`runn
 Commands to the actuators are polynomials through the same nodes, given by an input policy.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +46,7 @@ from jaxbeam.integrator.vehicles import (
     StepInput,
     Vehicles,
     VehicleStep,
+    absorber_samples,
     vehicle_state_norm,
     vehicles_of,
 )
@@ -282,7 +284,13 @@ def _chunk_function(
             before = states[:, : discrete.model.state_count]
             ends = _end_forces(loads, path, steps, before, state, forces)
             inputs = [before, forces, ends, commands]
-            running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs)
+            of_absorbers = None
+            if discrete.absorbers:
+                moving = xp.concatenate([states, state[None]])[:, discrete.model.state_count :]
+                of_absorbers = functools.partial(
+                    absorber_samples, loads, path, discrete.absorbers, moving, forces
+                )
+            running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs, of_absorbers)
         return state, memory, running_peaks, end, (states, commands, observed)
 
     return chunk, chunk_steps

@@ -31,6 +31,7 @@ from jaxbeam.integrator.kinks import may_have_kinks
 from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.integrator.vehicles import absorber_weights
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, WheelSet
@@ -316,9 +317,11 @@ def _path_nodes(starts, counts, lengths) -> Float[np.ndarray, "step node"]:
     return starts[panel, None] + lengths[panel, None] * (number[:, None] + fractions)
 
 
-def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:
+def integrate_peaks(
+    max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs, absorbers: int = 0
+) -> Peaks:
     """Peaks of tasks without a controller; see `integrate_loops`."""
-    return integrate_loops(max_loads, mask, inputs, None)[0]
+    return integrate_loops(max_loads, mask, inputs, None, absorbers)[0]
 
 
 class Integrated(NamedTuple):
@@ -335,14 +338,20 @@ class Integrated(NamedTuple):
 
 
 def integrate_loops(
-    max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs, loop: NativeLoop | None
+    max_loads: int,
+    mask: Bool[np.ndarray, " task"],
+    inputs: NativeInputs,
+    loop: NativeLoop | None,
+    absorbers: int = 0,
 ) -> Integrated:
     """Results of tasks by the C integrator, with histories if the inputs have samples.
 
     The C integrator must be `available`. The call releases the lock of Python for other threads.
 
-    `max_loads` is the largest number of loads on the beam at once. Tasks not in the mask stay at
-    rest. Raises MemoryError without memory for the matrices of the steps.
+    `max_loads` is the largest number of loads on the beam at once. The last wheels are those of
+    `absorbers`, and the last outputs the deflections there, twice, in place of which peaks are
+    those of their strokes, then of their forces. Tasks not in the mask stay at rest. Raises
+    MemoryError without memory for the matrices of the steps.
     """
     given, none = (mask, *inputs, *_constants()), np.zeros((1, 0, 0))
     arrays = [np.ascontiguousarray(none if array is None else array) for array in given]
@@ -363,7 +372,7 @@ def integrate_loops(
     if loop is not None:
         address = ctypes.cast(loop.process, ctypes.c_void_p)
         given_loop = ctypes.byref(_Loop(address, loop.commands, MARK_COUNT, loop.failures))
-    sizes = ctypes.c_int64(max_loads), ctypes.c_int64(samples)
+    sizes = map(ctypes.c_int64, (max_loads, samples, absorbers))
     if LIBRARY.load().integrate_peaks(*sizes, arguments, found, given_loop):
         raise MemoryError("there is no memory for the matrices of all steps of a sweep")
     amplitudes = np.sqrt(np.maximum.accumulate(amplitudes[..., ::-1], axis=-1)[..., ::-1])
@@ -379,6 +388,7 @@ def _constants() -> tuple[np.ndarray, ...]:
         np.asarray(PEAK_NODES),
         FORCE_FRACTIONS,
         force_weights_at_fractions(),
+        absorber_weights().reshape(-1, NODE_COUNT),
     )
     return tuple(np.asarray(part, float)[None] for part in constants)
 

@@ -103,12 +103,17 @@ class RunningPeaks(Module):
 
 @jax.named_scope("running_peaks")
 def update_peaks(
-    running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, inputs
+    running_peaks: RunningPeaks,
+    matrices: StepMatrices,
+    path: LoadPath,
+    inputs,
+    of_absorbers: Callable | None = None,
 ) -> RunningPeaks:
     """Running peaks after a further chunk of steps.
 
     `inputs` of the monitored outputs are states, contact forces at the nodes, contact forces at the
-    ends of the steps, and commands; the last two may be None.
+    ends of the steps, and commands; the last two may be None. `of_absorbers`, if given, takes
+    samples (step, sample, output, batch) to those with strokes and forces of absorbers.
     """
     states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
@@ -122,7 +127,10 @@ def update_peaks(
         outputs = on_states @ states + on_others @ xp.concatenate(others, axis=1)
         # Steps of zero length after the end are no part of the run.
         outputs = xp.where(length[:, None, None] > 0, outputs, 0.0)
-    samples = optimization_barrier(outputs.reshape(steps, len(PEAK_NODES), -1, batch_size))
+    samples = outputs.reshape(steps, len(PEAK_NODES), -1, batch_size)
+    if of_absorbers is not None:
+        samples = of_absorbers(samples)
+    samples = optimization_barrier(samples)
 
     largest = xp.max(xp.abs(samples), axis=(0, 1))
     # Whether this is a traced run whose steps are all in one chunk.

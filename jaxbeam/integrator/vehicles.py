@@ -22,14 +22,17 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbeam.integrator.load_path import LoadPath
 from jaxbeam.integrator.propagators import (
     GAUSS_NODES,
     NODE_COUNT,
+    PEAK_NODES,
     force_weights,
     phi_functions_of,
 )
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
+from jaxbeam.numerics.polynomials import lagrange_coefficients
 from jaxbeam.runtime.arrays import (
     Array,
     add_at,
@@ -302,3 +305,59 @@ def _rows_of(group: VehicleGroup, vehicle: int) -> slice:
     rows = group.wheels_per_vehicle * NODE_COUNT
     start = group.first_wheel * NODE_COUNT + vehicle * rows
     return slice(start, start + rows)
+
+
+def absorber_weights() -> Float[np.ndarray, "2 sample node"]:
+    """Weights of the forces on bodies of absorbers, at the peak nodes of a step of unit length.
+
+    Of the force itself, and of the displacement of a unit mass that is at zero at both ends.
+    """
+    powers, coefficients = np.arange(NODE_COUNT), lagrange_coefficients(NODE_COUNT)
+    c = np.array(PEAK_NODES)[:, None]
+    twice = (c ** (powers + 2) - c) / ((powers + 1) * (powers + 2))
+    return np.stack([c**powers @ coefficients.T, twice @ coefficients.T])
+
+
+def absorber_samples(
+    loads: LoadSet,
+    path: LoadPath,
+    count: int,
+    moving: Float[Array, "boundary vehicle_state batch"],
+    forces: Float[Array, "step row batch"],
+    samples: Float[Array, "step sample output batch"],
+) -> Float[Array, "step sample output batch"]:
+    """Samples of outputs with strokes (m), then forces (N), of the last `count` wheels.
+
+    In the place of these, samples have the deflections at the absorbers, twice. `moving` are the
+    states of all vehicles before each step and at the end. Heights of the body in a step are a
+    line through those at its ends, and the double integral of F / m_t, with the force F that
+    accelerates its inertia m_t (see `jaxbeam.case.absorbers`). What hangs on the beam has no
+    profile under it.
+    """
+    wheels, weights = loads.wheels, absorber_weights()
+    body = 1 / xp.stack([group.B[1, 0] for group in wheels.vehicles[-count:]])
+    inertia = body + wheels.inertia[-count:]
+    fraction = body / inertia
+    index = loads.wheel_count - count + np.arange(count)
+    by_row = -forces.reshape(len(forces), -1, 1, NODE_COUNT, forces.shape[-1])
+    own = (path.loads[:, :, None] == index) & path.pressing[:, :, None]
+    force = xp.sum(xp.where(own[..., None, None], by_row, 0.0), axis=1)  # step, absorber, node
+    deflection = samples[:, :, -count:]
+    height = moving[:, -2 * count :: 2]
+    if path.surface is not None:
+        at_rest = path.surface[:, 0, index, 0]
+        at_rest = at_rest.reshape(*at_rest.shape[:2], -1)
+        heights = height[:-1] - at_rest, height[1:] - at_rest
+    else:
+        heights = height[:-1], height[1:]
+    first, last = (
+        fraction * z + (1 - fraction) * y
+        for z, y in zip(heights, (deflection[:, 0], deflection[:, -1]), strict=True)
+    )
+    c, length = np.array(PEAK_NODES)[:, None, None], path.length[:, None, None]
+    pulled, moved = (xp.einsum("pk,takb->tpab", of, force) for of in weights)
+    body_height = (1 - c) * first[:, None] + c * last[:, None]
+    stroke = body_height + length[:, None] ** 2 * moved / inertia - deflection
+    found = xp.concatenate([samples[:, :, : -2 * count], stroke, pulled], axis=2)
+    # Steps of zero length after the end are no part of the run.
+    return xp.where(length[:, None] > 0, found, 0.0)

@@ -190,7 +190,9 @@ OF_FLIGHTS = {
 ACTING_COMMAND = (("time", "actuator"), "unit of a command", "command that acts on the beam")
 # Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {
-    "controller_failures": ((), "1", "steps at which the controller found no solution")
+    "peak_stroke": (("absorber",), "m", "largest absolute stroke of the absorber"),
+    "peak_absorber_force": (("absorber",), "N", "largest absolute force of the absorber"),
+    "controller_failures": ((), "1", "steps at which the controller found no solution"),
 }
 
 # Variables of the modes in records, with names that begin with mode_.

@@ -160,14 +160,16 @@ class RunSizes(NamedTuple):
     """Sizes of the runs of a sweep that decide how much memory they take.
 
     `places` on the beam end steps when a wheel passes, in addition to corrected sensors. Histories
-    have `samples` and `steps` per run. A profile or forces over time are stored at the nodes of
-    `given_steps`: forces (`has_forces`) and own profiles (`has_profiles`) for each run.
+    have `samples` and `steps` per run. Strokes and forces of `absorbers` are outputs, too. A
+    profile or forces over time are stored at the nodes of `given_steps`: forces (`has_forces`) and
+    own profiles (`has_profiles`) for each run.
     """
 
     modes: int
     states: int
     coupled: bool
     wheels: int
+    absorbers: int
     places: int
     samples: int
     steps: int
@@ -181,7 +183,7 @@ class RunSizes(NamedTuple):
         It counts the matrices of all step lengths (for C in `native/workspace.h`, for JAX in
         `DiscreteModel`), of a chunk of steps, and the results.
         """
-        panels, outputs = self.panels(sensors), len(sensors)
+        panels, outputs = self.panels(sensors), len(sensors) + 2 * self.absorbers
         side, modes_of_side = (self.states, self.modes) if self.coupled else (2, 1)
         rows, values = NODE_COUNT * self.wheels, len(PEAK_NODES) * outputs
         of_length = self.states * (9 * side + 56 * modes_of_side)
@@ -228,6 +230,7 @@ def run_sizes(
         states=states,
         coupled=has_coupling(case),
         wheels=loads.wheel_count,
+        absorbers=loads.absorbers,
         places=places,
         samples=samples,
         steps=steps,

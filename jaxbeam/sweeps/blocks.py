@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import logging
 import os
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -67,7 +68,11 @@ MAX_TRIAL_BATCHES = 16  # further batches of one run cost more than the steps th
 # Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
 # some hundredths of a second, programs some seconds.
 MAX_PATHS, MAX_RUNS = 8, 1024
-OF_SENSORS = {"peak_deflection": -1, "peak_time": -1, "deflection": -1}  # axis of the sensors
+# Numbers that change neither the model nor its outputs.
+LEAVES_MODEL_UNCHANGED = re.compile(
+    r"(loads|profile|run|controller)\.|absorbers\.(\d+|\*)\.(?!position)"
+)
+OF_SENSORS = "peak_deflection", "peak_time", "deflection"  # along the last axis
 
 
 class Runner:
@@ -104,12 +109,8 @@ class Runner:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         self.trials = Trials()
         self._set_block_size(most_batches)
-        # Loads, profiles, settings of the run and controllers do not change the model, so that all
-        # batches share one; not on several devices, each of which has the models of its part.
-        leaves_model_unchanged = ("loads.", "profile.", "run.", "controller.")
-        same_model = all(
-            name.startswith(leaves_model_unchanged) for name in batches.shared_addresses
-        )
+        # All batches share a model; not on several devices, each of which has those of its part.
+        same_model = all(map(LEAVES_MODEL_UNCHANGED.match, batches.shared_addresses))
         self.shared_model = shared_model(case) if same_model and self.devices == 1 else None
         self.program = self._make_program(native)
         in_c = self._native_batches(most_inputs) if native else None
@@ -272,7 +273,9 @@ class Runner:
 
         So relative errors do not compare peaks of different quantities.
         """
-        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        absorbers = len(self.case.absorbers)
+        quantities = [*(sensor.quantity for sensor in self.case.sensors), *absorbers * ["stroke"]]
+        quantities = np.array([*quantities, *absorbers * ["absorber_force"]])
         return np.concatenate(
             [peaks * (quantities == one) for one in np.unique(quantities)], axis=1
         )
@@ -376,11 +379,15 @@ class SensorGroups:
 
         def compute(block: int) -> dict[str, np.ndarray]:
             parts = [function(block) for function in functions]
-            joined = {
-                name: np.concatenate([part[name] for part in parts], axis)[..., order]
-                for name, axis in OF_SENSORS.items()
-                if name in parts[0]
-            }
+            joined = {}
+            for name in set(OF_SENSORS) & set(parts[0]):
+                split = [
+                    np.split(part[name], [len(group)], -1)
+                    for part, group in zip(parts, self.groups, strict=True)
+                ]
+                of_sensors = np.concatenate([own for own, _ in split], -1)[..., order]
+                of_absorbers = split[0][1]  # in each group the same
+                joined[name] = np.concatenate([of_sensors, of_absorbers], -1)
             return parts[0] | joined
 
         return compute

@@ -150,10 +150,15 @@ def _to_dataset(
         name: collapse(values, 0, 2)[rows]  # padding is at the end, or left out
         for name, values in results.items()
     }
+    failed = ~np.all(np.isfinite(flat["peak_deflection"]), axis=1)
     if case.absorbers:  # which hold on to the beam
         of_wheels = [name for name in flat if SWEEP_VARIABLES[name][0] == ("load",)]
         flat |= {name: flat[name][:, : -len(case.absorbers)] for name in of_wheels}
-    failed = ~np.all(np.isfinite(flat["peak_deflection"]), axis=1)
+        sensors = len(case.sensors)
+        ends = sensors, sensors + len(case.absorbers)
+        names = "peak_deflection", "peak_stroke", "peak_absorber_force"
+        flat |= zip(names, np.split(flat["peak_deflection"], ends, axis=1), strict=True)
+        flat["peak_time"] = flat["peak_time"][:, :sensors]
     variables: dict[str, Any] = {
         "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})
     }

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.profiles.shapes import AbstractProfile
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import (
@@ -126,7 +127,9 @@ class Program(NamedTuple):
     def discretise(self, model, shared_values, stepping, policy=None):
         """Discrete model of a batch, with the outputs of its sensors."""
         grid = self.grid(model, shared_values, stepping)
-        return discrete_model(model, grid, None, policy, *self.outputs(model, shared_values))
+        outputs = self.outputs(model, shared_values)
+        discrete = discrete_model(model, grid, None, policy, *outputs)
+        return dataclasses.replace(discrete, absorbers=len(self.case.absorbers))
 
     def outputs(self, model, shared_values) -> Outputs:
         """Output rows and static correction of the sensors of a batch."""
@@ -136,9 +139,14 @@ class Program(NamedTuple):
 
 
 def outputs_of(case: Case, model: ModalModel) -> Outputs:
-    """Output rows of the sensors of a case on the modal states, and their static correction."""
-    rows = sensor_rows(model, case, case.sensors)
-    return rows, static_correction(model, case, case.sensors, rows)
+    """Output rows of the sensors of a case on the modal states, and their static correction.
+
+    The last are those of the deflections at its absorbers, twice: of strokes and of forces.
+    """
+    places = [Sensor(absorber.position) for absorber in case.absorbers]
+    sensors = *case.sensors, *places, *places
+    rows = sensor_rows(model, case, sensors)
+    return rows, static_correction(model, case, sensors, rows)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
@@ -464,8 +472,8 @@ class CompiledBatches(Batchwise):
                     self._compiled_variants.add((substeps, single))
             results = compiled_program(*arguments)
         if compiled_program is native_block:
-            max_loads = program.shapes.max_loads
-            return native_peaks.integrate_peaks(max_loads, mask, results)._asdict()
+            given = program.shapes.max_loads, mask, results, len(program.case.absorbers)
+            return native_peaks.integrate_peaks(*given)._asdict()
         return {name: np.asarray(values) for name, values in results.items()}
 
     def _program(self, substeps: int | None) -> Program:

@@ -240,7 +240,8 @@ class NativeLoops:
         inputs: native_peaks.NativeInputs,
     ) -> dict[str, np.ndarray]:
         """Results of batches by name; NaN for runs that diverge."""
-        found = native_peaks.integrate_loops(max_loads, mask, inputs, self.loop)
+        absorbers = len(self.program.case.absorbers)
+        found = native_peaks.integrate_loops(max_loads, mask, inputs, self.loop, absorbers)
         peaks, failures, amplitudes, history = found
         for row in np.flatnonzero(mask):
             grown = np.moveaxis(amplitudes[row], -1, 0)
@@ -500,7 +501,8 @@ class NativeBatches:
         if self.loops is not None:
             found = self.loops.integrate(batch_indices, max_loads, mask, inputs)
         else:
-            integrated = native_peaks.integrate_loops(max_loads, mask, inputs, None)
+            absorbers = len(self.program.case.absorbers)
+            integrated = native_peaks.integrate_loops(max_loads, mask, inputs, None, absorbers)
             found = integrated.peaks._asdict() | {"deflection": integrated.history}
         if inputs.samples is None:
             del found["deflection"]

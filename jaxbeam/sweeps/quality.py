@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace, structure_of
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.static_shapes import longest_stable_step, max_concurrent_loads
 from jaxbeam.integrator.step_size import check_step_count, trial_run, without_later_vibration
@@ -67,6 +68,33 @@ def warn_of_failures(dataset: "xarray.Dataset") -> None:
     sentence = failure_sentence(dataset)
     if sentence:
         warnings.warn(sentence, FailedRunsWarning, stacklevel=3)
+
+
+class StrokeWarning(UserWarning):
+    """Warning of absorbers whose strokes exceed the largest allowed in runs of a sweep."""
+
+
+def warn_of_strokes(case: Case, dataset: "xarray.Dataset") -> None:
+    """Warn of absorbers of a case whose strokes exceed `max_stroke` in runs of its sweep."""
+    for i, absorber in enumerate(case.absorbers):
+        name = next((n for n in _max_stroke_names(i) if n in dataset.coords), None)
+        if name is None and absorber.max_stroke is None:
+            continue
+        strokes = dataset["peak_stroke"].isel(absorber=i)
+        limit = float(concrete(absorber.max_stroke)) if name is None else dataset[name]
+        above = (strokes > limit).values
+        if above.any():
+            warnings.warn(
+                f"the stroke of absorber {i} exceeds its max_stroke in {above.sum()} of"
+                f" {above.size} runs; the largest stroke is {strokes.max().item():.4g} m",
+                StrokeWarning,
+                stacklevel=3,
+            )
+
+
+def _max_stroke_names(i: int) -> tuple[str, str]:
+    """Addresses at which the largest stroke of an absorber may be swept."""
+    return f"absorbers.{i}.max_stroke", "absorbers.*.max_stroke"
 
 
 class TruncationWarning(UserWarning):

@@ -15,7 +15,7 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
-from jaxbeam.sweeps.quality import warn_of_failures, warn_of_truncation
+from jaxbeam.sweeps.quality import warn_of_failures, warn_of_strokes, warn_of_truncation
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.store import read_dataset, writing
 from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
@@ -69,7 +69,9 @@ def sweep(
     `peak_deflection` (..., sensor) in m and its time in s (for sensors of other quantities
     `peak_acceleration` and so on, each NaN at the others), the smallest contact force in N and the
     time of its first negative value in s (..., load), and `failed`, which marks runs that are not
-    finite; their results are NaN. There is a warning of such runs, the attribute `failed_runs` is
+    finite; their results are NaN. With absorbers it has `peak_stroke` in m and
+    `peak_absorber_force` in N (..., absorber); runs whose stroke exceeds `max_stroke` are warned
+    of. There is a warning of failed runs, the attribute `failed_runs` is
     their number, and `error_estimate` is NaN where all runs fail. With a controller,
     `controller_failures` counts its steps without a solution. With `histories`, `deflection`
     (..., time, sensor) in m is at the run's sample rate.
@@ -144,4 +146,5 @@ def sweep(
 
     dataset = computed(None, "new") if store is None else stored(Path(store))
     warn_of_failures(dataset)
+    warn_of_strokes(case, dataset)
     return dataset

@@ -299,7 +299,21 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
-    return [*lines, *_truncation_lines(results), *_contact_lines(case, results, addresses)]
+    contact = _contact_lines(case, results, addresses)
+    return [*lines, *_truncation_lines(results), *_absorber_lines(results, addresses), *contact]
+
+
+def _absorber_lines(results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:
+    """Largest stroke and force of each absorber, with their runs."""
+    rows = []
+    for i in range(results.sizes.get("absorber", 0)):
+        for words, name in (("stroke (m)", "peak_stroke"), ("force (N)", "peak_absorber_force")):
+            peaks = results[name].values[..., i]
+            run = _run_of_largest(peaks)
+            values = _swept_values(results, run, addresses)
+            rows.append((str(i), words, f"{peaks[run]:.6g}", *values))
+    heads = [_head(results[address]) for address in addresses]
+    return table(("absorber", "largest", "size", *heads), rows) if rows else []
 
 
 def _truncation_lines(results: "xarray.Dataset") -> list[str]:

@@ -144,8 +144,8 @@ static void end_slopes(Workspace *w) {
 
 /* Integrate the tasks, and write their outputs, (task, run, position) or (task, run, load); 1 if
  * there is no memory for it. */
-EXPORTED int integrate_peaks(int64_t max_loads, int64_t samples, const Array *arguments,
-                             double *const *outputs, const Loop *loop) {
+EXPORTED int integrate_peaks(int64_t max_loads, int64_t samples, int64_t absorbers,
+                             const Array *arguments, double *const *outputs, const Loop *loop) {
     const int64_t *sizes[ARGUMENT_COUNT];
     for (int i = 0; i < ARGUMENT_COUNT; i++) sizes[i] = arguments[i].sizes;
     Workspace workspace = {.panels = (int)sizes[STEP_COUNTS][1],
@@ -162,6 +162,8 @@ EXPORTED int integrate_peaks(int64_t max_loads, int64_t samples, const Array *ar
                            .influence_pieces = (int)sizes[INFLUENCE_SERIES][1],
                            .influence_terms = (int)sizes[INFLUENCE_SERIES][2],
                            .batch_size = sizes[INERTIA][2],
+                           .absorbers = (int)absorbers,
+                           .input_entries = (int)sizes[VEHICLE_INPUT_MATRIX][1],
                            .groups_of_vehicles = (int)sizes[VEHICLES][1],
                            .vehicles = arguments[VEHICLES].numbers,
                            .has_surface = sizes[SURFACE][1] > 0,

@@ -50,6 +50,46 @@ static void write_sample(const Workspace *w, int64_t sample, const Group *g) {
     }
 }
 
+/* Strokes, and forces, of absorbers at the peak nodes of a step, in place of the deflections there:
+ * integrator/vehicles.py, `absorber_samples`. */
+static void sample_absorbers(const Workspace *w, const Step *step, const Group *g,
+                             Register *sampled) {
+    enum { ABSORBER_STATES = 2 };
+    const Register length = broadcast(step->length), *end = sampled + w->sample_count - w->positions;
+    for (int a = 0; a < w->absorbers; a++) {
+        const int behind = w->absorbers - a, wheel = w->loads - behind, first = w->positions - behind;
+        const int of_stroke = first - w->absorbers, at = w->vehicle_states - ABSORBER_STATES * behind;
+        const int64_t entry = w->input_entries - ABSORBER_STATES * behind + 1;
+        const double *mobility = w->inputs[VEHICLE_INPUT_MATRIX] + entry * w->vehicle_runs;
+        const Register body = 1 / of_group(mobility, w->vehicle_runs, g);
+        const Register inertia =
+            body + load(w->inputs[INERTIA] + wheel * w->batch_size + g->first, g->count);
+        const Register fraction = body / inertia, scale = length * length / inertia;
+        Register z_first = g->next_vehicle_state[at], z_last = g->vehicle_state[at];
+        if (w->has_surface) {
+            const Register height = profile_motion(w, step, g, wheel, HEIGHT, 0);
+            z_first -= height, z_last -= height;
+        }
+        const Register u_first = fraction * z_first + (1 - fraction) * sampled[of_stroke],
+                       u_last = fraction * z_last + (1 - fraction) * end[of_stroke];
+        Register none[NODES] = {{0}};
+        const Register *forces = none;
+        for (int s = 0; s < step->loads; s++)
+            if (step->load_numbers[s] == wheel) forces = g->next_state + w->states + s * NODES;
+        const double *weights = w->inputs[ABSORBER_WEIGHTS];
+        for (int p = 0; p < PEAK_POINTS; p++, weights += NODES) {
+            const double c = w->inputs[PEAK_FRACTIONS][p];
+            Register pulled = {0}, moved = {0}, *sample = sampled + p * w->positions;
+            for (int k = 0; k < NODES; k++) {
+                pulled -= weights[k] * forces[k];
+                moved -= weights[PEAK_POINTS * NODES + k] * forces[k];
+            }
+            sample[of_stroke] = (1 - c) * u_first + c * u_last + scale * moved - sample[of_stroke];
+            sample[first] = pulled;
+        }
+    }
+}
+
 /* Deflections at the peak nodes of a step, the largest of them, and a bound of those between; from
  * the state before the step. */
 static void sample_positions(const Workspace *w, int t, const Step *step, const Group *g) {
@@ -57,6 +97,7 @@ static void sample_positions(const Workspace *w, int t, const Step *step, const 
     memset(sampled, 0, (size_t)w->sample_count * sizeof *sampled);
     add_product(sampled, step->sample_rows, w->sample_count, g->next_state,
                 w->states + step->rows + step->ends);
+    if (w->absorbers) sample_absorbers(w, step, g, sampled);
     for (int position = 0; position < w->positions; position++) {
         Register largest = {0};
         for (int i = position; i < w->sample_count; i += w->positions)

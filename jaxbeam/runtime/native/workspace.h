@@ -62,6 +62,7 @@ enum {
     PEAK_FRACTIONS,
     FORCE_FRACTIONS,
     FORCE_WEIGHTS,
+    ABSORBER_WEIGHTS,
     ARGUMENT_COUNT
 };
 enum {
@@ -131,6 +132,8 @@ typedef struct {
     int panels, lengths, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
     int influence_pieces, influence_terms;
     int states, all_modes, sample_count, columns;
+    /* The last wheels, whose vehicles are absorbers; entries of the input matrices of all vehicles. */
+    int absorbers, input_entries;
     /* Loads with vehicles and their VEHICLE_NUMBERS; motions that are needed, states of all
      * vehicles, the largest numbers of one, registers of the propagators of all loads. */
     int groups_of_vehicles, motions, vehicle_states, most_states, most_wheels, vehicle_registers;
