@@ -222,8 +222,8 @@ def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
 
 
 # Largest number of cells of a period, or of each part before and after a delayed command begins;
-# and largest phase of the fastest mode, or of a vehicle, in a cell, exact to about 1e-9.
-CELLS, MAX_PHASE_PER_CELL = 8, 1.7
+# and largest phase of the fastest mode, or of a vehicle, in one. Commands are exact to some 1e-9.
+CELLS, MAX_PHASE_PER_CELL = 8, 0.6
 
 
 class Preview(Module):
