@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import ContactLossWarning
-from tests.loop_as_oracle import parts_of
+from tests.loop_as_oracle import parts_of, span_of
 from tests.oracles.modal_equations import respond
+from tests.oracles.vehicle_elements import Car, quarter_cross
+from tests.strategies.examples import CONTROLLED, LOADS, PROFILES
 
 MAX_RATIO = 1.5  # of the true error over the stated one
 EXACT = 1e-11  # tolerance of the reference: a hundredth of the smallest below
@@ -64,6 +67,47 @@ def random_case(seed: int) -> jb.Case:
         case,
         actuators=(jb.PointForce(0.5 * length),),
         controller=jb.OutputFeedback([[20.0, 0.0, 0.0]], period=rng.uniform(0.002, 0.02)),
+    )
+
+
+def scaled(part, rng, most: float = 0.1):
+    """A load or profile whose numbers are each multiplied by a random factor near 1."""
+    return jax.tree.map(
+        lambda leaf: (
+            leaf * rng.uniform(1 - most, 1 + most)
+            if isinstance(leaf, float) or getattr(np.asarray(leaf).dtype, "kind", "") == "f"
+            else leaf
+        ),
+        part,
+    )
+
+
+def whole_case(seed: int) -> jb.Case:
+    """Loads, profiles, absorbers and tapers of all kinds, in turn; every third a loop of a law."""
+    rng, numbers = np.random.default_rng(seed), np.random.default_rng(seed).uniform
+    if seed % 3 == 0:
+        return list(CONTROLLED.values())[seed // 3 % len(CONTROLLED)]
+    uniform, place = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}, rng.uniform(0.2, 0.4)
+    sizes = {"mass_per_length": 0.5, "flexural_rigidity": [numbers(8, 20), numbers(-3, 3)]}
+    tapered = {"segments": [jb.Segment(place, **sizes), jb.Segment(0.6 - place, **sizes)]}
+    damper = jb.Absorber(0.3, mass=0.02, frequency=rng.uniform(10, 25), damping_ratio=0.1)
+    quantities = "deflection", "velocity", "slope", "acceleration", "moment", "shear"
+    names = rng.choice(list(LOADS), rng.integers(1, 3), replace=False)
+    profile = PROFILES[str(rng.choice(list(PROFILES)))] if rng.random() < 0.4 else None
+    return jb.Case(
+        jb.Beam(
+            0.6,
+            damping_ratio=rng.uniform(0, 0.05),
+            modes=int(rng.integers(1, 7)),
+            ends=str(rng.choice(ENDS)),
+            **(tapered if rng.random() < 0.25 else uniform),
+        ),
+        supports=[jb.Support(0.28, rng.choice([None, 2e3]))] if rng.random() < 0.25 else [],
+        absorbers=[damper] if rng.random() < 0.25 else [],
+        sensors=[jb.Sensor(x, str(rng.choice(quantities))) for x in rng.uniform(0.1, 0.5, 3)],
+        loads=[scaled(LOADS[str(name)], rng) for name in names],
+        profile=None if profile is None else scaled(profile, rng),
+        run=jb.Run(rng.uniform(0.25, 0.5), sample_rate=float(rng.choice([20.0, 50.0, 200.0]))),
     )
 
 
@@ -132,6 +176,44 @@ def check_traced_run(seed: int, tolerance: float, unknown: bool) -> float:
     return float(error / (stated + 2 * EXACT))
 
 
+SCALED = "speed", "mass", "force", "body_mass", "weight", "positions", "offsets"
+
+
+def check_whole_case(case: jb.Case, tolerance: float) -> float:
+    """The same of a run as it is and of one traced by JAX, and of what each sensor measures."""
+    if isinstance(case.controller, jb.ScenarioMPC):  # double precision gives it no more than 2e-10
+        tolerance = max(tolerance, TOLERANCES[0])
+    exact = max(1e-3 * tolerance, 1e-10)
+    numbers = {
+        address: np.asarray(value)
+        for address, value in jb.addresses(case).items()
+        if address.startswith("loads.0.") and address.endswith(SCALED)
+    } or {"beam.damping_ratio": np.asarray(case.beam.damping_ratio)}
+
+    def outcome(factor):
+        varied = {address: factor * value for address, value in numbers.items()}
+        record = jb.simulate(jb.replace(case, varied), tolerance=tolerance)
+        extremes = xp.stack([record.smallest, record.largest])
+        return record.peak_deflection, extremes, record.error_estimate, record.step_errors
+
+    reference = jb.simulate(case, tolerance=exact)
+    extremes = np.array([reference.smallest, reference.largest])
+    sizes, along = np.max(np.abs(extremes), axis=0), largest_deflection(reference)
+    ratios = [0.0]
+    for peaks, found, stated, of_sensors in (
+        outcome(1.0),
+        jax.jvp(outcome, (1.0,), (1.0,))[0],
+    ):
+        error = np.max(np.abs(peaks - reference.peak_deflection), initial=0.0)
+        errors = np.max(np.abs(found - extremes), axis=0)
+        assert error <= tolerance * along and stated <= 2 * tolerance
+        moving = sizes > 0  # of a load that has not come, all is zero
+        own = of_sensors + 2 * reference.step_errors + 1e-10
+        ratios += [error / (stated + 2 * exact) / along] if along else []
+        ratios += list((errors[moving] / sizes[moving]) / own[moving])
+    return float(max(ratios))
+
+
 def check(seed: int, swept: bool) -> None:
     case = random_case(seed)
     with warnings.catch_warnings():
@@ -175,6 +257,78 @@ def test_three_hundred_random_cases(first):
         check(seed, swept=seed % 10 == 0)
         for unknown in False, True:
             assert check_traced_run(seed, TOLERANCES[seed % 3], unknown) < MAX_RATIO, seed
+
+
+LINE_LOAD = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.031185, ends="clamped-clamped", modes=6),
+    sensors=[jb.Sensor(x) for x in (0.245142, 0.337287, 0.25678)],
+    loads=[
+        jb.LineLoad(
+            speed=2.50495645847,
+            force_per_length=[4.51876, 1.8075],
+            lengths=[0.185647, 0.0928234],
+            gaps=[0.0, 0.105798],
+            tail=45.3970782225,
+            points=8,
+        )
+    ],
+    run=jb.Run(0.444084, sample_rate=20.0),
+)
+
+
+@pytest.mark.parametrize(
+    ("case", "tolerance"), [(LINE_LOAD, 1e-7), (CONTROLLED["mpc-vehicle"], 1e-7)]
+)
+def test_whole_cases_that_were_found_at_random(case, tolerance):
+    """Their errors were 1.8 and 200 times the stated ones.
+
+    A step had nearly three periods of the highest mode, and its halves nearly half its error; and
+    the predictions of a law whose numbers were traced had shorter cells than those of the same law.
+    """
+    assert check_whole_case(case, tolerance) < MAX_RATIO
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+@pytest.mark.parametrize("first", range(0, 210, 10))
+def test_two_hundred_whole_cases(first):
+    for seed in range(first, first + 10):
+        ratio = check_whole_case(whole_case(seed), TOLERANCES[seed // 3 % 3])
+        assert ratio < MAX_RATIO, seed
+
+
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_traced_peaks_of_a_car_on_a_wave_by_scipy(tolerance):
+    """By DOP853 with 1e-12, over the whole run and around the instant of the peak."""
+    case = jb.Case(
+        jb.Beam(0.7, 12.0, 0.5, damping_ratio=0.01, modes=3),
+        sensors=[jb.Sensor(0.31)],
+        loads=[jb.QuarterCar(0.6, 0.05, 60.0, 0.4, 900.0, 0.1, speed=3.0)],
+        profile=jb.profiles.SineProfile(amplitude=1e-3, wavelength=0.2, phase=0.4),
+        run=jb.Run(0.4, sample_rate=10.0),
+    )
+
+    def run(factor):
+        record = jb.simulate(jb.replace(case, {"loads.0.speed": 3.0 * factor}), tolerance=tolerance)
+        return record.peak_deflection[0], record.peak_time[0], record.error_estimate
+
+    (peak, time, stated), _ = jax.jvp(run, (1.0,), (1.0,))
+    near, wave = time + 2e-4 * np.linspace(-1.0, 1.0, 9), 2 * np.pi / 0.2
+    times = np.unique(np.concatenate([[0.0], np.linspace(0.0, 0.4, 401)[1:], near]))
+    states, _ = quarter_cross(
+        span_of(case),
+        Car(0.6, 0.05, 60.0, 0.4, 900.0, 0.1),
+        lambda t: (3.0 * t, 3.0),
+        lambda x: (1e-3 * np.sin(wave * x + 0.4), 1e-3 * wave * np.cos(wave * x + 0.4)),
+        [0.7 / 3.0],
+        times,
+    )
+    values = np.abs(states[:, :3] @ span_of(case).shapes(0.31))
+    fitted = values[np.isin(times, near)]
+    curve = np.polynomial.Polynomial.fit((near - time) / 2e-4, fitted, 6)
+    exact = curve(np.linspace(-1.0, 1.0, 4001)).max()
+    assert exact >= values.max() * (1 - 1e-12)
+    error = abs(float(peak) - exact) / largest_deflection(jb.simulate(case, tolerance=tolerance))
+    assert error < MAX_RATIO * float(stated) + 2e-11
 
 
 @pytest.mark.parametrize("modes", [1, 3, 6])
