@@ -21,7 +21,6 @@ from experiments.thesis.verdicts import (
     FITTED,
     INCONSISTENT,
     IRREPRODUCIBLE,
-    NOT_COUNTED,
     NOT_REPRODUCED,
     NULL_MET,
     REPEATED,
@@ -36,27 +35,22 @@ COUNTS = ROOT / "docs" / "howto" / "reproduce.md"
 BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
 INTRODUCTION = """# The numbers of the thesis, and which are reproduced
 
-Each number in the thesis that can be computed stands here with a verdict, which was given as by
-somebody who tries to refute it. The rules:
+Each number in the thesis that can be computed has a verdict:
 
-- A computed number is *reproduced* if it follows from printed parameters to a unit of its last
-  digit, the rounding of those parameters included; a measured one within twice the noise of the
-  sensors, which section 5.1 prints: no table is judged by its own scatter.
-- It is *explained* if a reading of the text other than the literal one gives it, and no parameter
-  was fitted to that very number. One reading serves for all numbers of a physical rig in a chapter:
-  the likeliest, with all readings in the report.
-- It *cannot be right* only by a proof that the report shows. Where a proof is of several numbers
-  together, these *cannot all be right*, and none of them is called wrong by itself. Else a number
-  is *not reproduced*.
-- A number that a null model (no control, static, one mode) meets within the same tolerance, or that
-  cannot tell the reading from it, counts for nothing, nor does one that a parameter was fitted to,
-  one that repeats another or follows from printed ones by arithmetic, or a yes or a no.
+- *reproduced*: it follows from printed parameters to a unit of its last digit, their rounding
+  included; a measured one within twice the noise of the sensors (section 5.1);
+- *explained*: another reading of the text gives it, to which no parameter was fitted; one reading
+  serves for all numbers of a rig in a chapter;
+- *cannot be right*, or together with others *cannot all be right*: by a proof that is shown;
+- else *not reproduced*.
 
-In the lists the number of the thesis comes first, the computed one in brackets, then the reason.
-This page is written from the report of `jaxbeam reproduce --all`, by
-`python -m experiments.thesis.page`. Where numbers were computed with parameters that are not
-printed, these can be identified: [two of them from one
-figure](../tutorials/notebooks/13_read_a_thesis) predict another.
+A number counts for nothing if a null model (no control, static, one mode) meets it as well, if a
+parameter was fitted to it, if it repeats another, or if it is a yes or a no.
+
+The number of the thesis comes first, the computed one in brackets, then the reason. The report of
+`jaxbeam reproduce --all`, from which `python -m experiments.thesis.page` writes this page, has all
+readings, and those that count for nothing. Parameters that are not printed can be
+[identified](../tutorials/notebooks/13_read_a_thesis).
 """
 
 
@@ -87,7 +81,7 @@ def sentence(report: dict) -> str:
 
 
 def page(report: dict) -> str:
-    """The page on the thesis: counts by experiment, then each number that is not reproduced."""
+    """The page on the thesis: counts, then each number that counts and is not reproduced."""
     header = ("experiment", *ALL_VERDICTS)
     rows = []
     for name, experiment in report["experiments"].items():
@@ -99,7 +93,7 @@ def page(report: dict) -> str:
     parts = [INTRODUCTION, sentence(report), "", _table(header, rows), ""]
     parts += ["## Reading of each rig", "", *(f"- {rig}: {its}." for rig, its in readings.items())]
     parts += [""]
-    for verdict in (*VERDICTS[1:], *NOT_COUNTED):
+    for verdict in VERDICTS[1:]:
         lines = [_line(one, verdict) for _, one in findings(report) if verdict in one["verdicts"]]
         if lines:
             parts += [f"## {verdict[0].upper()}{verdict[1:]}", "", *lines, ""]
@@ -119,10 +113,6 @@ def _line(one: dict, verdict: str) -> str:
         IRREPRODUCIBLE: one["impossible because"],
         INCONSISTENT: one["inconsistent because"],
         NOT_REPRODUCED: one["remark"],
-        NULL_MET: one["null model"],
-        FITTED: one["reading"],
-        REPEATED: one["repeats"],
-        STATEMENT: "",
     }
     reason = reasons[verdict]
     return f"- {one['where']}, {one['what']}: {pairs}" + (f": {reason}." if reason else ".")
