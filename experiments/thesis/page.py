@@ -39,8 +39,8 @@ Each number in the thesis that can be computed has a verdict:
 
 - *reproduced*: it follows from printed parameters to a unit of its last digit, their rounding
   included; a measured one within twice the noise of the sensors (section 5.1);
-- *explained*: another reading of the text gives it, to which no parameter was fitted; one reading
-  serves for all numbers of a rig in a chapter;
+- *explained*: another reading of the text gives it, to which no parameter was fitted: that of its
+  rig and chapter, listed below;
 - *cannot be right*, or together with others *cannot all be right*: by a proof that is shown;
 - else *not reproduced*.
 
@@ -109,7 +109,7 @@ def _line(one: dict, verdict: str) -> str:
         for i in which
     )
     reasons = {
-        EXPLAINED: one["reading"],
+        EXPLAINED: "",
         IRREPRODUCIBLE: one["impossible because"],
         INCONSISTENT: one["inconsistent because"],
         NOT_REPRODUCED: one["remark"],

@@ -343,7 +343,7 @@ def test_numbers_are_counted_and_listed_with_their_reasons():
     assert page.counts(VERDICTS) == {NULL_MET: 1, EXPLAINED: 1, NOT_REPRODUCED: 1}
     assert "Of the 3 numbers of the thesis that can be computed 2 count" in page.sentence(VERDICTS)
     text = page.page(VERDICTS)
-    assert "- Table 9, peaks: 2 (2): else." in text
+    assert "- Table 9, peaks: 2 (2)." in text
     assert "- Table 9, peaks: 3: the speed is not printed." in text
     assert "no control." not in text  # counts for nothing
     assert "- rig A: else." in text
