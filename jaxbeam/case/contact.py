@@ -34,7 +34,10 @@ HERTZ_POWER = 1.5  # of the compression, in the force of a ball or a crowned whe
 
 
 class AbstractContact(ReprWithUnits, Module):
-    """Contact of all wheels; a subclass that declares a `kind` is one of case files."""
+    """Contact of all wheels with the surface: what happens where one would have to pull.
+
+    To add one, write a subclass that declares its `kind`.
+    """
 
     kind: ClassVar[str]
 

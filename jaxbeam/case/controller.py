@@ -171,7 +171,7 @@ def commanded(actuators: Sequence[Any]) -> tuple[int, ...]:
 
 
 class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
-    """Settings of a controller.
+    """Law that computes commands to the actuators from readings of the sensors, and its settings.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`
     (s) later and is held until the next one. Without a period the law acts in continuous time.

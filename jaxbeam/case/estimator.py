@@ -84,7 +84,7 @@ class AbstractContinuousFilter(Module):
 
 
 class AbstractEstimator(ReprWithUnits, Module, metaclass=ExplainsArguments):
-    """Settings of an estimator; it acts at the samples of its controller.
+    """Estimate of the state from readings, at the samples of a controller, and its settings.
 
     To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.
     """

@@ -50,7 +50,7 @@ class SectionStiffening(Module):
 
 
 class AbstractActuator(ReprWithUnits, Module):
-    """Interface of actuators.
+    """Device that turns a command, in V, A or N, into a force or a couple on the beam.
 
     To add one, write a file in `jaxbeam.case.actuators` with a subclass that declares its `kind`.
     """

@@ -123,7 +123,10 @@ def plain_wheels(
 
 
 class AbstractLoad(ReprWithUnits):
-    """Interface of loads. A subclass that declares a `kind` is one of case files."""
+    """What crosses the beam or stands on it: force, mass, vehicle, train, pedestrian or crowd.
+
+    To add one, write a file in `jaxbeam.case.loads` with a subclass that declares its `kind`.
+    """
 
     kind: ClassVar[str]
     speed: eqx.AbstractVar[Float[Array, ""] | None]
