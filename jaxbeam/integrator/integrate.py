@@ -242,17 +242,19 @@ def _chunk_function(
     max_loads: int,
     policy: AbstractInputPolicy | None,
     steps: int | None = None,
+    most: int | None = None,
 ):
     """Function that advances state, memory and running peaks by a chunk, and steps of a chunk.
 
     The function also returns the time (s) at the end of the chunk, and the histories (states before
     each step, commands at the nodes, observations). A traced run of `steps` is a single chunk, if
-    memory allows it.
+    memory allows it; chunks have `most` steps, if it is given.
     """
 
     chunk_steps = chunk_length(
         discrete, loads, max_loads, any_jax(discrete, loads, policy) and steps
     )
+    chunk_steps = min(chunk_steps, most or chunk_steps)
     vehicles = vehicles_of(loads, discrete.grid.lengths)
 
     def chunk(state, memory, running_peaks: Any, first_step):
@@ -427,8 +429,10 @@ def integrate_peaks(
     after the last exit cannot raise any peak. `max_loads` is the largest number of loads on the
     beam at once. Forward mode only.
     """
-    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
     grid = discrete.grid
+    # Where NumPy could take all steps at once, a chunk ends after the last exit: the loop may, too.
+    most = None if policy is not None or any_jax(grid) else int(grid.loaded_steps) + 1
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, most=most)
 
     def unfinished(carry):
         *_, first_step, continues = carry

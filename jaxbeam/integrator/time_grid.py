@@ -373,6 +373,12 @@ class TimeGrid(Module):
         """Number of steps."""
         return self.cumulative_counts[-1]
 
+    @property
+    def loaded_steps(self) -> Int[Array, ""]:
+        """Number of steps until no load is on the beam any more."""
+        loaded = xp.any(self.loads_on_beam, axis=1)
+        return xp.max(xp.where(loaded, self.cumulative_counts, 0))
+
     def locate_steps(self, index: Int[Array, " step"]):
         """Panel, start time (s) and index of the length of the steps with these indices."""
         after_end = index >= self.step_count
