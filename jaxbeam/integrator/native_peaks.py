@@ -11,6 +11,7 @@ sweep needs; and compile after the C.
 """
 
 import ctypes
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -379,6 +380,7 @@ def integrate_loops(
     return Integrated(peaks, failures, amplitudes, history)
 
 
+@functools.cache
 def _constants() -> tuple[np.ndarray, ...]:
     """Nodes, weights and coefficients of the integrator, the same for all tasks."""
     constants = (
@@ -390,7 +392,7 @@ def _constants() -> tuple[np.ndarray, ...]:
         force_weights_at_fractions(),
         absorber_weights().reshape(-1, NODE_COUNT),
     )
-    return tuple(np.asarray(part, float)[None] for part in constants)
+    return tuple(np.ascontiguousarray(part, float)[None] for part in constants)
 
 
 def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:

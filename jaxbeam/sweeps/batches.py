@@ -107,10 +107,14 @@ def make_batches(
     )
 
 
+def evenly_spaced(count: int, most: int) -> Int[np.ndarray, " chosen"]:
+    """Indices of at most `most` of some things, evenly spaced from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
 def with_few_runs(batches: Batches, most: int) -> Batches:
     """Batches reduced to at most `most` of their runs, evenly spaced from the first to the last."""
-    runs = batches.run_index.shape[1]
-    chosen = np.unique(np.linspace(0, runs - 1, min(most, runs)).round().astype(int))
+    chosen = evenly_spaced(batches.run_index.shape[1], most)
     values, index = batches.batched_values[:, chosen], batches.run_index[:, chosen]
     return dataclasses.replace(batches, batched_values=values, run_index=index)
 

@@ -6,6 +6,7 @@ for eight runs at once. Numbers of the loop are arguments, so that loops of one 
 same compiled code.
 """
 
+import copy
 import dataclasses
 import functools
 import itertools
@@ -53,7 +54,7 @@ from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.sampled_loop import LoopMemory, SampledLoop
-from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, values_at, with_few_runs
+from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, evenly_spaced, values_at, with_few_runs
 from jaxbeam.sweeps.integration import Outputs, Program, outputs_of
 from jaxbeam.sweeps.step_size import PathEvents
 
@@ -459,10 +460,13 @@ class NativeBatches:
         """Integrator of the batches reduced to `most` runs; None with a control loop."""
         if self.loops is not None:
             return None
-        few, sizes = with_few_runs(self.batches, most), (self.block_size, self.most_at_once)
-        return NativeBatches(
-            self.program, self.shared_model, self.events[0], few, *sizes, schedule=self.schedule
-        )
+        few, chosen = copy.copy(self), evenly_spaced(self.batches.run_index.shape[1], most)
+        few.batches = with_few_runs(self.batches, most)
+        few._load_set = functools.cache(few._load_set_of)
+        if self.all_loads is not None:
+            paths, wheels = self.all_loads
+            few.all_loads = paths, jax.tree.map(lambda part: part[..., chosen], wheels)
+        return few
 
     def block_integrator(
         self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
