@@ -20,7 +20,6 @@ from .case.contact import (
     BilateralContact as BilateralContact,
     UnilateralContact as UnilateralContact,
 )
-from .case.filters import Filter as Filter
 from .case.loads import vehicles as vehicles
 from .case.loads.axles import Axles as Axles, LineLoad as LineLoad
 from .case.loads.point import (
@@ -28,9 +27,9 @@ from .case.loads.point import (
     MovingMass as MovingMass,
     VaryingForce as VaryingForce,
 )
-from .case.loads.vehicles.cars import Oscillator as Oscillator, QuarterCar as QuarterCar
+from .case.loads.vehicles import Oscillator as Oscillator, QuarterCar as QuarterCar
 from .case.loads.walking import Crowd as Crowd, Pedestrian as Pedestrian
-from .case.sensors import Sensor as Sensor
+from .case.sensors import Filter as Filter, Sensor as Sensor
 from .case.track import Track as Track
 from .control import receptance_method as receptance_method
 from .control.compensators import PD as PD, PositivePositionFeedback as PositivePositionFeedback
@@ -40,16 +39,16 @@ from .control.feedback import (
     ScheduledFeedback as ScheduledFeedback,
 )
 from .control.feedforward import Feedforward as Feedforward, Prescribed as Prescribed
+from .control.gpc import GPC as GPC, AdaptiveGPC as AdaptiveGPC
+from .control.h_infinity import HInfinity as HInfinity
 from .control.internal_model import (
     InternalModel as InternalModel,
     ScheduledInternalModel as ScheduledInternalModel,
 )
 from .control.load_identification import LoadIdentification as LoadIdentification
-from .control.optimal.h_infinity import HInfinity as HInfinity
-from .control.optimal.lqr import LQR as LQR
-from .control.predictive.gpc import GPC as GPC, AdaptiveGPC as AdaptiveGPC
-from .control.predictive.mpc import MPC as MPC
-from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
+from .control.lqr import LQR as LQR
+from .control.mpc import MPC as MPC
+from .control.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.semi_active import SemiActive as SemiActive
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_controller import StateFeedback as StateFeedback
@@ -62,8 +61,7 @@ from .files.case_file import load_case as load_case, save_case as save_case
 from .files.tables import save as save
 from .model import frequency_responses as frequency_responses, statics as statics
 from .model.frequency_responses import frequency_response as frequency_response
-from .model.plausibility.check import check as check
-from .model.plausibility.checked_modes import modes as modes
+from .model.plausibility.check import check as check, modes as modes
 from .model.state_space import state_space as state_space
 from .model.statics import influence_line as influence_line
 from .simulation.record import Record as Record, Result as Result

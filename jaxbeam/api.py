@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxbeam.case.case import Case, part_classes
 from jaxbeam.case.fields import refuses_traced
-from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.case.sensors import sensor_labels
+from jaxbeam.case.toml_file import parse_toml
 from jaxbeam.files.case_file import case_from_tables, load_case_with
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 from jaxbeam.model.plausibility.facts import Plausibility

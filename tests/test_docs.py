@@ -22,12 +22,11 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.contact import AbstractContact
-from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.controller import AbstractController, AbstractEstimator
 from jaxbeam.case.fields import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
-from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicles import load_vehicle
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.track import Track

@@ -25,7 +25,7 @@ jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
 jaxbeam.plot  jaxbeam.benchmark
 jaxbeam  jaxbeam.api
-tuning.checkpoint  tuning.optional
+tuning.checkpoint
 tuning.logs
 tuning.parameters  tuning.modal
 tuning.fit

@@ -18,8 +18,7 @@ import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import run_peaks
 from jaxbeam.analysis.stability import frozen_poles, growth, stream
 from jaxbeam.case.controller import Measurement
-from jaxbeam.case.filters import Filter
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES, Filter
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
@@ -31,7 +30,7 @@ from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.runtime.arrays import any_jax, xp
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, xla_options
 from jaxbeam.simulation.integration_plan import integration_plan, sample_times
@@ -349,7 +348,7 @@ def test_plain_calls_compile_nothing(tmp_path):
     code = (
         "import jax; jax.config.update('jax_log_compiles', True)\n"
         "import dataclasses, sys, numpy as np, jaxbeam as jb\n"
-        "from jaxbeam.analysis.margins import stability_margin\n"
+        "from jaxbeam.analysis.stability import stability_margin\n"
         "from jaxbeam.analysis.stability import frozen_poles, growth\n"
         "case = jb.load_case('case.toml')\n"
         "beam = dataclasses.replace(case.beam, modes=7, damping_ratio=0.01)\n"

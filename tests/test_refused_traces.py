@@ -13,14 +13,14 @@ from jaxbeam.analysis import stability
 from jaxbeam.analysis.combinations import combine
 from jaxbeam.analysis.compare import compare
 from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
-from jaxbeam.analysis.margins import stability_margin
 from jaxbeam.analysis.sections import (
     characteristic_points,
     influence_table,
     record_amplification,
 )
+from jaxbeam.analysis.stability import stability_margin
 from jaxbeam.control.receptance_method import closed_loop_poles, receptance_feedback
-from jaxbeam.model import linear_system
+from jaxbeam.model import state_space
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
@@ -59,8 +59,8 @@ REFUSED = {
     "dataset of responses": lambda case, path: responses(case).to_xarray(),
     "figure of responses": lambda case, path: responses(case).plot(),
     "points": lambda case, path: characteristic_points(case),
-    "poles of a plant": lambda case, path: linear_system.poles(case),
-    "zeros of a plant": lambda case, path: linear_system.zeros(case, ("force@0.3", "velocity@0.2")),
+    "poles of a plant": lambda case, path: state_space.poles(case),
+    "zeros of a plant": lambda case, path: state_space.zeros(case, ("force@0.3", "velocity@0.2")),
     "poles": lambda case, path: closed_loop_poles(case, LAW),
     "feedback that keeps modes": lambda case, path: receptance_feedback(case, [-9 + 99j], keep=[1]),
     "load model": lambda case, path: load_model_envelope(case, "HL-93", [0.3]),

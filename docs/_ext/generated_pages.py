@@ -21,7 +21,7 @@ from jaxbeam.runtime.printer import TableViews
 GROUPS = {
     "beam": ("Beams, supports, sensors and cases", "jaxbeam.case"),
     "loads": ("Loads and vehicles", "jaxbeam.case.loads"),
-    "profiles": ("Profiles of the surface", "jaxbeam.case.profiles", "jaxbeam.files.profile_file"),
+    "profiles": ("Profiles of the surface", "jaxbeam.case.profiles", "jaxbeam.files.case_file"),
     "actuators": ("Actuators", "jaxbeam.case.actuators"),
     "control": ("Controllers", "jaxbeam.control"),
     "estimation": ("Estimators", "jaxbeam.estimation"),
@@ -51,7 +51,7 @@ INTERFACES = [
     ("jaxbeam.case.controller", "AbstractContinuousLaw"),
     ("jaxbeam.case.controller", "Measurement"),
     ("jaxbeam.case.controller", "ControlStep"),
-    ("jaxbeam.case.estimator", "AbstractEstimator"),
+    ("jaxbeam.case.controller", "AbstractEstimator"),
     ("jaxbeam.model.modes", "Modes"),
     ("jaxbeam.model.state_space", "StateSpace"),
 ]

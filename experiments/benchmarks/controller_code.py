@@ -22,7 +22,7 @@ from experiments.benchmarks.controller_steps import CONTROLLERS, MODES, PERIOD, 
 from jaxbeam.c_code import CProgram, export_c, write_c
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import kinds
-from jaxbeam.control.optimal.sampled_lqr import SamplingWarning
+from jaxbeam.control.sampled_lqr import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 LOST = 0.05  # of the readings

@@ -180,7 +180,7 @@ import dataclasses, numpy as np, jaxbeam as jb
 jb.modes, jb.simulate, jb.sweep, jb.state_space, jb.frequency_response, jb.bound
 jb.statics.static_peak
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.analysis.margins import margins
+from jaxbeam.analysis.stability import margins
 from jaxbeam.analysis.stability import frozen_poles, growth
 case = jb.load_case("{case}")
 """

@@ -36,7 +36,7 @@ from experiments.benchmarks.common import (
     time_call,
 )
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
-from jaxbeam.control.optimal.sampled_lqr import SamplingWarning
+from jaxbeam.control.sampled_lqr import SamplingWarning
 from jaxbeam.model.state_space import state_space
 from jaxbeam.numerics.qp import solve_qp
 from jaxbeam.runtime.compiling import compiled

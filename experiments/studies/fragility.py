@@ -15,10 +15,16 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.studies import tune_feedforward
-from experiments.studies.hand_set import HAND_DRAWN, HAND_SET, drawn_table, trapezium
 from experiments.studies.held_out import HELD_OUT_ENTRY_TIME, with_rigidity
 from experiments.studies.sensor_feedback import SENSORS_ONLY, bench_case, with_cutoff
-from experiments.studies.tuned_feedforward import BENCH, with_bench_delay
+from experiments.studies.tuned_feedforward import (
+    BENCH,
+    HAND_DRAWN,
+    HAND_SET,
+    drawn_table,
+    trapezium,
+    with_bench_delay,
+)
 from experiments.thesis.cases import with_duration
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.plot.style import colour, set_title, use_style

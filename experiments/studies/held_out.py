@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 import tuning
-from experiments.thesis.chapter6.patch_rigs import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF
-from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.cases import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF
+from experiments.thesis.report import plot_commands, plot_deflections
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
 from tuning.control.load_cases import AddressValues

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis.cases import plan_with_steps, reduction, with_duration
-from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.report import plot_commands, plot_deflections
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.plot.style import GREY, colour, set_title, use_style
 
 MASS, SPEED, ENTRY_TIMES = 0.371, 1.0, np.array([0.0, 0.25, 0.5])  # kg, m/s, s

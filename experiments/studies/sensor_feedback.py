@@ -18,7 +18,6 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
-from experiments.studies.hand_set import HAND_DRAWN, drawn_table
 from experiments.studies.held_out import (
     CUBIC_CUTOFFS,
     CUBIC_FEEDBACK,
@@ -41,8 +40,8 @@ from experiments.studies.tune_sensor_feedback import (
     READING_OFFSET,
     with_noise_and_filters,
 )
-from experiments.thesis.cases import with_modes
-from experiments.thesis.chapter6.patch_rigs import with_feedback
+from experiments.studies.tuned_feedforward import HAND_DRAWN, drawn_table
+from experiments.thesis.cases import with_feedback, with_modes
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case

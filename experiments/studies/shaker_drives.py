@@ -14,7 +14,7 @@ import jaxbeam as jb
 from experiments.thesis.cases import data_physics_v4
 from jaxbeam import rigs
 from jaxbeam.case.actuators.electrodynamic import AbstractInnerLoop
-from jaxbeam.model.linear_system import poles
+from jaxbeam.model.state_space import poles
 
 FREQUENCIES = np.geomspace(1.0, 100.0, 600)  # Hz
 TOLERANCE = 0.1  # of the force at 1 Hz, by which a precise force may differ

@@ -1,9 +1,10 @@
-"""Report of experiments: published numbers beside computed ones, as text and as sections."""
+"""Report of experiments: published numbers beside computed ones, as text, sections and figures."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+import jaxbeam as jb
 from experiments.thesis.verdicts import (
     FITTED,
     INCONSISTENT,
@@ -17,7 +18,47 @@ from experiments.thesis.verdicts import (
     reading_name,
 )
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
+from jaxbeam.plot.style import colour
 from jaxbeam.runtime.printer import text_table
+
+
+def plot_deflections(
+    axes, records: Mapping[str, jb.Record], sensor: int = 0, colours: Sequence[str] | None = None
+) -> None:
+    """Draw the deflection (mm) at one sensor over time (s), a labelled curve for each record.
+
+    `colours` has one for each record; those of the style if left out.
+    """
+    for i, (name, record) in enumerate(records.items()):
+        history = 1e3 * np.asarray(record.deflection)[:, sensor]
+        line_colour = colour(i) if colours is None else colours[i]
+        axes.plot(record.times, history, color=line_colour, label=name)
+
+
+def plot_commands(
+    axes,
+    records: Mapping[str, jb.Record],
+    actuators: Sequence[int] = (0,),
+    gains: Sequence[float] | None = None,
+    held: bool = False,
+    colours: Sequence[str] | None = None,
+) -> None:
+    """Draw commands (V) to some actuators over time (s), in the colour of each record.
+
+    Records without a controller are left out; the second command is dashed. `gains` has a factor
+    for each command. `held` draws steps, for commands that are held between samples.
+    """
+    drawstyle = "steps-post" if held else "default"
+    for i, record in enumerate(records.values()):
+        if record.case.controller is None:
+            continue
+        line_colour = colour(i) if colours is None else colours[i]
+        commands = np.asarray(record.command)[:, list(actuators)]
+        if gains is not None:
+            commands = commands * np.asarray(gains)
+        for command, dashes in zip(commands.T, ("-", "--"), strict=False):
+            axes.plot(record.times, command, dashes, color=line_colour, drawstyle=drawstyle)
+
 
 TITLE = "The thesis, reproduced"
 ALL_VERDICTS = (*VERDICTS, *NOT_COUNTED)

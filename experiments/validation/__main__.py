@@ -10,7 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 
-from experiments.validation.page import PAGE_FILE, Check, validation_page
+from experiments.validation.checks import PAGE_FILE, Check, validation_page
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 

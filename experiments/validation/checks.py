@@ -8,10 +8,16 @@ code with jaxbeam.
 Checks of beams and crossings: frequencies, statics, deflections, energy and derivatives.
 
 The closed forms, finite elements and scipy solutions of `tests/oracles` share no code with jaxbeam.
+
+The validation page: errors of jaxbeam against independent sources, computed when written.
 """
 
 import dataclasses
-from collections.abc import Iterator
+import platform
+from collections.abc import Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
 
 import clarabel
 import jax
@@ -22,12 +28,11 @@ import scipy.signal
 import scipy.sparse
 
 import jaxbeam as jb
-from experiments.validation.page import Check, max_entrywise_error, max_relative_error
 from jaxbeam import rigs
-from jaxbeam.analysis.bound.bound import Bound
-from jaxbeam.analysis.bound.input_influence import input_influence
-from jaxbeam.case.filters import filter_history, second_order_sections, steady_filter_state
+from jaxbeam.analysis.bound.bound import Bound, input_influence
+from jaxbeam.case.sensors import filter_history, second_order_sections, steady_filter_state
 from jaxbeam.estimation.observer import kalman_gain, sampled_kalman_gain
+from jaxbeam.files.report import ReportSection, ReportTable, markdown
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests import loop_as_oracle
@@ -46,6 +51,67 @@ from tests.oracles.closed_forms import (
 )
 from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span
+
+PAGE_FILE = Path(__file__).parents[2] / "VALIDATION.md"
+INTRODUCTION = """Each row compares jaxbeam with a reference that shares no code with it: closed
+forms, finite elements, scipy, another solver. Errors are relative, and were computed when this page
+was written, by
+
+    .venv/bin/uv run python -m experiments.validation
+
+which fails if an error exceeds its tolerance. The references are in `tests/oracles`; the tests
+compare many more cases with them."""
+
+
+class Check(NamedTuple):
+    """A quantity computed by jaxbeam, a reference, and the relative error beside its tolerance."""
+
+    quantity: str
+    reference: str
+    error: float
+    tolerance: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within the tolerance; NaN is not."""
+        return self.error <= self.tolerance
+
+
+def max_relative_error(computed, expected) -> float:
+    """Largest difference over the largest expected value."""
+    computed, expected = np.asarray(computed), np.asarray(expected)
+    return float(np.max(np.abs(computed - expected)) / np.max(np.abs(expected)))
+
+
+def max_entrywise_error(computed, expected) -> float:
+    """Largest difference of any entry over that entry."""
+    return float(np.max(np.abs(np.asarray(computed) / np.asarray(expected) - 1)))
+
+
+def validation_page(groups: Sequence[tuple[str, Sequence[Check]]]) -> str:
+    """The page in Markdown: a table for each group of checks."""
+    checks = [check for _, group in groups for check in group]
+    passed = sum(check.passed for check in checks)
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("jaxbeam", "jax", "scipy"))
+    summary = (
+        f"**{passed} of {len(checks)} errors are within their tolerances**"
+        f" ({versions}, Python {platform.python_version()})."
+    )
+    sections = [ReportSection("", [INTRODUCTION, summary])]
+    for title, group in groups:
+        rows = [
+            (
+                check.quantity,
+                check.reference,
+                f"{check.error:.1e}",
+                f"{check.tolerance:.0e}",
+                "within" if check.passed else "**above**",
+            )
+            for check in group
+        ]
+        header = ("quantity", "reference", "error", "tolerance", "")
+        sections.append(ReportSection(title, [ReportTable(header, rows)]))
+    return markdown("Validation", sections)
 
 
 def loops() -> Iterator[Check]:

@@ -8,10 +8,10 @@ stable within 2 % of the mode, given its frequency, is in the last column: it ma
 import numpy as np
 
 from experiments.validation import measured_forces, modal_identification
-from experiments.validation.expected_gain import expected_gain
 from experiments.validation.least_errors import (
     QUANTILE,
     LeastErrors,
+    expected_gain,
     least_errors,
     least_errors_of_decays,
     least_errors_of_forced,

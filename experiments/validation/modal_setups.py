@@ -25,7 +25,7 @@ from experiments.validation.modal_identification import (
 )
 from tests.oracles.planted_structures import Planted, random_structure, sampled
 from tuning.modal.identify_modes import identify_modes
-from tuning.modal.setups.merge import merge_setups
+from tuning.modal.setups import merge_setups
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "modal_setups.md"
 KINDS = ("ambient", "impacts", "decay", "crossing")

@@ -19,8 +19,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, suggestion
 from jaxbeam.model.modes import Modes, modes
 from jaxbeam.runtime.arrays import Array, xp
 

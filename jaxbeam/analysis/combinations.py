@@ -23,9 +23,8 @@ from jaxbeam.analysis.load_models import (
 )
 from jaxbeam.analysis.sections import envelope
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import concrete, refuses_traced
-from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.case.fields import concrete, refuses_traced, suggestion
+from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.model.along_beam import sections
 from jaxbeam.model.statics import REACTION
 from jaxbeam.runtime.printer import TableViews

@@ -1,12 +1,21 @@
-"""Speeds at which loads in a row build up vibration, and at which a load leaves none behind."""
+"""Speeds at which loads in a row build up vibration, and at which a load leaves none behind.
 
+A run-up on a rough track, the distance before the bridge, lets initial motion of vehicles decay.
+The free motion of a vehicle on a rigid surface decays as exp(-sigma t), with sigma the least decay
+rate of its modes. At speed v a fraction e of it is left after the distance v ln(1 / e) / sigma.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.base import wheel_distances
+from jaxbeam.case.loads.base import AbstractVehicleLoad, wheel_distances
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import modes
 
 SAME_DISTANCE = 1e-3  # m: distances of wheels that are equal
@@ -85,3 +94,88 @@ def cancellation_speeds(
             if order != mode and (order - mode) % 2 == 0
         ]
     return found
+
+
+SHARE = 0.01  # fraction of the free motion of a vehicle that is left when it enters the bridge
+SWITCH = 10.0  # m, over which a profile grows from a level surface
+
+
+def decay_rates(case: Case) -> list[float]:
+    """Least decay rate (1/s) of the vehicles of each load on a rigid surface.
+
+    Infinite for loads without springs, 0 without damping.
+    """
+    loads = load_set(case)
+    rates, of_wheel = [math.inf] * len(case.loads), loads.load_of_wheel
+    for group in loads.wheels.vehicles:
+        number = of_wheel[group.first_wheel]
+        if number < len(rates):
+            poles = np.linalg.eigvals(concrete(group.A)[..., 0])
+            rates[number] = max(0.0, float(np.min(-poles.real)))
+    return rates
+
+
+def run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> list[float]:
+    """Run-up (m) of each load: distance before the bridge in which its free motion decays.
+
+    A fraction `share` of the motion is left at entry; at the fastest of some `speeds` (m/s), by
+    default at its own. Zero for loads without springs, and by a table of times. Raises ValueError
+    for a share not between 0 and 1, and for a vehicle without damping.
+
+    >>> import jaxbeam as jb
+    >>> from jaxbeam.analysis.critical_speeds import run_up
+    >>> car = jb.Oscillator(mass=1000.0, stiffness=4e4, damping=2e3, speed=20.0)
+    >>> case = jb.Case(jb.Beam(20.0, 1e10, 12e3), loads=[car])
+    >>> print(round(run_up(case)[0], 2))  # sigma = c / (2 m) = 1 / s, 20 m/s ln 100
+    92.1
+    """
+    if not 0 < share < 1:
+        raise ValueError(f"share lies between 0 and 1; it is {share:g}")
+    distances = []
+    for i, (load, rate) in enumerate(zip(case.loads, decay_rates(case), strict=True)):
+        if load.speed is None or math.isinf(rate):
+            distances.append(0.0)
+            continue
+        if not rate > 0:
+            raise ValueError(
+                f"loads.{i} never forgets how it started: a mode of the vehicle has no damping;"
+                " give each suspension a damper"
+            )
+        fastest = max((abs(v) for v in speeds), default=abs(float(concrete(load.speed))))
+        distances.append(fastest * math.log(1 / share) / rate)
+    return distances
+
+
+def with_run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> Case:
+    """The case with its vehicles far enough before the bridge for their free motion to decay.
+
+    Those with springs that travel start on a level surface, from which the profile grows over 10 m,
+    the largest `run_up` of all loads before the bridge; the run lasts as much longer, at the
+    slowest of the `speeds`. Tables of times stay as they are. Raises ValueError as `run_up`, and
+    for vehicles from both ends.
+    """
+    distance = max(run_up(case, share, speeds), default=0.0)
+    if distance == 0:
+        return case
+    start, length, loads, delays = distance + SWITCH, float(concrete(case.beam.length)), [], [0.0]
+    signs = set()
+    for load, rate in zip(case.loads, decay_rates(case), strict=True):
+        if load.speed is None or math.isinf(rate) or not isinstance(load, AbstractVehicleLoad):
+            loads.append(load)
+            continue
+        speed = float(concrete(load.speed))
+        signs.add(speed < 0)
+        position = length + start if speed < 0 else -start
+        loads.append(dataclasses.replace(load, start_position=position))
+        delays.append(start / min((abs(v) for v in speeds), default=abs(speed)))
+    if len(signs) > 1:
+        raise ValueError(
+            "vehicles enter at both ends, and a profile grows from one: make a case of each, or"
+            " give start_position and profile.switch_on"
+        )
+    ends = (length + start, length + distance) if signs == {True} else (-start, -distance)
+    profile = case.profile
+    if profile is not None and hasattr(profile, "switch_on"):
+        profile = dataclasses.replace(profile, switch_on=ends)
+    run = dataclasses.replace(case.run, duration=case.run.duration + max(delays))
+    return dataclasses.replace(case, loads=tuple(loads), profile=profile, run=run)

@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, suggestion
 from jaxbeam.model.modes import modes
 from jaxbeam.runtime.printer import TableViews
 

@@ -21,22 +21,20 @@ from jaxbeam.case.controller import (
     AbstractSampledLaw,
     Measurement,
 )
-from jaxbeam.case.filters import filter_step
+from jaxbeam.case.sensors import filter_step
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
-from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.sensor_signals import (
+from jaxbeam.model.sensor_signals import (
     initial_filter_state,
     sensor_sections,
     with_sensor_filters,
 )
-from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.numerics.discretisation import propagate
-from jaxbeam.runtime.arrays import Array, any_jax, ravel_pytree, to_numpy, xp
+from jaxbeam.model.state_space import Plant, StateSpace, build_plant
+from jaxbeam.numerics.stages import propagate
+from jaxbeam.runtime.arrays import Array, Module, any_jax, ravel_pytree, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.runtime.module import Module
 
 STEP = 2.0**20  # of each argument; exact in floating point, and far above the value at zero
 TRIAL_SIZES = 1e-6, 1.0, 1e6  # of random arguments at which an affine function is one

@@ -30,10 +30,11 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep, Measurement
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.state_space import Signal, StateSpace
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     any_traced,
     ravel_pytree,
     scan,
@@ -44,7 +45,6 @@ from jaxbeam.runtime.arrays import (
     zeros,
 )
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
-from jaxbeam.runtime.module import Module
 
 
 class LinearLaw(AbstractSampledLaw):

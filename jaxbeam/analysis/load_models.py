@@ -11,10 +11,9 @@ from jaxtyping import Float
 
 from jaxbeam.analysis.sections import Envelope, envelope
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete, refuses_traced
+from jaxbeam.case.fields import check_on_beam, concrete, refuses_traced, suggestion
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.quantities import quantity_of
+from jaxbeam.case.sensors import quantity_of
 from jaxbeam.case.track import Kernel
 from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections

@@ -21,8 +21,7 @@ from jaxbeam.analysis.frozen_loop import (
 )
 from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.controller import LawOfCommanded
-from jaxbeam.case.estimator import AbstractSampledFilter
+from jaxbeam.case.controller import AbstractSampledFilter, LawOfCommanded
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.point import MovingMass
 from jaxbeam.case.trajectory import NEVER

@@ -11,7 +11,7 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.case.case import Case, own_addresses, unit_at
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.files.tables import sweep_columns
 from jaxbeam.runtime.progress import following
 

@@ -8,12 +8,11 @@ import jaxbeam as jb
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.vehicles.vehicle import vehicle_names
+from jaxbeam.case.loads.vehicles import vehicle_names
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.plot.schematic import actuator_positions, surface_height
-from jaxbeam.plot.traffic.drawing import DrawnVehicle, drawn_vehicle
+from jaxbeam.plot.drawing import DrawnVehicle, actuator_positions, drawn_vehicle, surface_height
 from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 

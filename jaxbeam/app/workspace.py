@@ -36,8 +36,7 @@ from jaxbeam.case.case import (
     unit_at,
 )
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.reading.toml_file import parse_toml
-from jaxbeam.case.reading.units import is_quantity, number_and_unit, number_in_si
+from jaxbeam.case.toml_file import is_quantity, number_and_unit, number_in_si, parse_toml
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.rigs import RIG_NAMES
 from jaxbeam.runtime.input_file import read_input, read_text_input

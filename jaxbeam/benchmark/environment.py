@@ -28,10 +28,9 @@ from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule
 from jaxbeam.integrator.vehicles import vehicles_of
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.load_set import load_set
-from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
+from jaxbeam.runtime.arrays import Module
+from jaxbeam.simulation.closed_loop import LoopMemory, SampledLoop, closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times
-from jaxbeam.simulation.sampled_loop import LoopMemory, SampledLoop
 from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan
 
 TOLERANCE = 1e-9  # of the steps, relative to the largest deflection

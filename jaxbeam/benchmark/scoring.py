@@ -30,7 +30,7 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Module
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 LEAST_SHARE = -1.0  # that counts for a run that diverges, or is worse

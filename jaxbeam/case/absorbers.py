@@ -17,9 +17,16 @@ so that absorbers run as the vehicles of `jaxbeam.case.loads.base` do, standing.
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.display import ReprWithUnits
-from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    ON_BEAM,
+    POSITIVE,
+    concrete,
+    is_concrete,
+    number,
+    validate_exactly_one,
+)
 from jaxbeam.case.loads.base import ForceHistory, VehicleModel
 from jaxbeam.case.trajectory import StandingTrajectory
 from jaxbeam.runtime.arrays import Array, Number, xp

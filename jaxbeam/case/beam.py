@@ -10,18 +10,20 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.declared_checks import check_on_beam, suggestion, validate_direct_or_derived
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
     POSITIVE,
+    check_on_beam,
     choice,
     concrete,
     count,
     is_concrete,
     number,
     parts,
+    suggestion,
+    validate_direct_or_derived,
 )
 from jaxbeam.runtime.arrays import Array, Number, xp
 
@@ -304,7 +306,7 @@ class Support(ReprWithUnits):
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
     Supports enter the modes of the beam, except for their dampers, which couple the modes. A run
-    starts at rest on settled supports: see `jaxbeam.model.settlement`.
+    starts at rest on settled supports: see `jaxbeam.model.transfer_matrices`.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(1.2, 12.0, 0.5)

@@ -19,6 +19,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.display import ReprWithUnits, case_html, case_text
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
+    OF_QUANTITY,
     POSITIVE,
     choice,
     concrete,
@@ -28,15 +29,13 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.former_words import attribute_address, present_address
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
-from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
-from jaxbeam.case.quantities import OF_QUANTITY
-from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.toml_file import in_si
 from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory
-from jaxbeam.runtime.arrays import Array, Number, set_at, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, Number, set_at, xp
 
 ALL = "*"
 

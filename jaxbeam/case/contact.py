@@ -22,8 +22,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, number
-from jaxbeam.runtime.arrays import Number
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Module, Number
 
 ONE_RUN = (
     "contact.kind 'unilateral' is for one run of concrete numbers by jaxbeam.simulate, without"

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxbeam.case.declared_checks import in_unit, suggestion
-from jaxbeam.runtime.module import Module
+from jaxbeam.case.fields import in_unit, suggestion
+from jaxbeam.runtime.arrays import Module
 from jaxbeam.runtime.printer import html_table
 
 # Least largest value, factor and prefix.

@@ -3,7 +3,7 @@
 An axle at x presses with fractions w_k at x + o_k: on three sleepers, at any offsets, or over a
 length. What is off the beam then rests on the ground. A force on the modes psi is thus that of the
 filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`). A track of layers,
-rail, pads, sleepers and ballast, has modes with the beam (see `jaxbeam.model.theory.layers`).
+rail, pads, sleepers and ballast, has modes with the beam (see `jaxbeam.model.track`).
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
-from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.runtime.arrays import Array, Number, xp
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     fori_loop,
     is_jax,
     set_at,
@@ -16,7 +17,6 @@ from jaxbeam.runtime.arrays import (
     vmap,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 SAME_TIME = 1e-12  # of a time: a sample that is earlier by less is at it

@@ -17,24 +17,25 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support, has
 from jaxbeam.case.case import Case, list_sizes, parts
 from jaxbeam.case.contact import ONE_RUN, AbstractContact
-from jaxbeam.case.declared_checks import (
+from jaxbeam.case.fields import (
+    ON_BEAM,
     POSITION_TOLERANCE,
+    all_concrete,
     check_fields,
     check_on_beam,
+    concrete,
     describe_value,
+    is_concrete,
 )
-from jaxbeam.case.fields import ON_BEAM, all_concrete, concrete, is_concrete
-from jaxbeam.case.filters import nyquist_error
-from jaxbeam.case.limits import MAX_WHEELS, check_length
 from jaxbeam.case.loads.base import (
     AbstractLoad,
     VehicleModel,
     wheel_distances,
 )
-from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
-from jaxbeam.case.quantities import NO_TORSION, QUANTITIES
-from jaxbeam.case.sensors import Sensor, sensor_labels
+from jaxbeam.case.sensors import NO_TORSION, QUANTITIES, Sensor, nyquist_error, sensor_labels
+from jaxbeam.case.toml_file import MAX_WHEELS, check_length
 from jaxbeam.case.track import Track
 from jaxbeam.runtime.arrays import Array
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxbeam.case.reading.units import is_quantity, number_and_unit
+from jaxbeam.case.toml_file import is_quantity, number_and_unit
 from jaxbeam.files.endings import check_ending
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def pair_in_si(case: "Case", address: str, pair: Bounds, option: str) -> tuple[f
     if not any(isinstance(value, str) for value in pair):
         return float(pair[0]), float(pair[1])
     from jaxbeam.case.case import unit_at, value_at
-    from jaxbeam.case.reading.units import in_si
+    from jaxbeam.case.toml_file import in_si
 
     value_at(case, address)  # says what is wrong with the address
     first, second = in_si(list(pair), unit_at(case, address), f"{option} {address}")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import (
     UsageError,
     check_suffix,

@@ -22,7 +22,7 @@ from jaxbeam.case.controller import (
     ControlStep,
 )
 from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
-from jaxbeam.case.filters import filter_step
+from jaxbeam.case.sensors import filter_step
 from jaxbeam.control.feedback import pairing_error
 from jaxbeam.runtime.arrays import Array, Number, xp
 

@@ -23,9 +23,8 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, count, is_concrete, number
-from jaxbeam.case.filters import Filter, filter_step, second_order_sections, steady_filter_state
-from jaxbeam.runtime.arrays import Array, Number, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.case.sensors import Filter, filter_step, second_order_sections, steady_filter_state
+from jaxbeam.runtime.arrays import Array, Module, Number, xp
 
 
 class InternalModel(AbstractController):

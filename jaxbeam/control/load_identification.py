@@ -24,9 +24,8 @@ from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
-from jaxbeam.runtime.arrays import Array, Number, scan, take, xp
+from jaxbeam.runtime.arrays import Array, Module, Number, scan, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.module import Module
 
 # A line through identified positions is accepted when their scatter is at most this fraction of the
 # distance over which they are identified, and their weights add up to this many times the largest

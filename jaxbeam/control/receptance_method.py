@@ -25,8 +25,7 @@ from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import OutputFeedback
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.runtime.arrays import Array, is_jax, solve, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, is_jax, solve, xp
 
 __all__ = [
     "ReceptanceFeedback",

@@ -1,1 +1,1 @@
-"""Estimators of the state, one a file, with the interface of `jaxbeam.case.estimator`."""
+"""Estimators of the state, one a file, with the interface of `jaxbeam.case.controller`."""

@@ -8,14 +8,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractSampledFilter, Estimate, EstimatedLoads
+from jaxbeam.case.controller import AbstractSampledFilter, Estimate, EstimatedLoads
 from jaxbeam.estimation.observer import filter_gain, sensor_offsets
-from jaxbeam.estimation.sampled_plant import Transition, in_blocks
-from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
+from jaxbeam.estimation.sampled_plant import FilteredPlant, SensorChain, Transition, in_blocks
 from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.model.contact import mass_contact_rows
-from jaxbeam.model.linear_system import Signal, StateSpace
-from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.model.output_rows import OutputRows
+from jaxbeam.model.state_space import Signal, StateSpace
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, add_at, scan, take, xp
 

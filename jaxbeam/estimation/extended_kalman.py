@@ -14,9 +14,9 @@ from jaxbeam.estimation.kalman import (
     reading_variance,
 )
 from jaxbeam.estimation.observability import detectability_error, mode_count
-from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
+from jaxbeam.estimation.sampled_plant import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.stages import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
 # Of length, speed and mass of the design; over these derivatives are differences.

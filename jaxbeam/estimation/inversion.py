@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractEstimator, AbstractSampledFilter, Estimate
+from jaxbeam.case.controller import AbstractEstimator, AbstractSampledFilter, Estimate
 from jaxbeam.case.fields import POSITIVE, concrete, number
 from jaxbeam.estimation.observability import (
     UNOBSERVABLE,
@@ -18,7 +18,7 @@ from jaxbeam.estimation.observability import (
 )
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition
-from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.stages import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
 MAX_CONDITION_NUMBER = 100.0  # of the mode shapes at the sensors; beyond, there is a warning

@@ -7,23 +7,22 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.controller import AbstractEstimator
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
-from jaxbeam.estimation.continuous import ContinuousCrossingFilter, TimeInvariantFilter
 from jaxbeam.estimation.crossing_filter import CrossingFilter
 from jaxbeam.estimation.observability import detectability_error, mode_count
 from jaxbeam.estimation.observer import (
     ConstantGainFilter,
+    ContinuousCrossingFilter,
+    TimeInvariantFilter,
     kalman_gain,
     sampled_kalman_gain,
     sensor_offsets,
 )
-from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING
-from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
+from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING, filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.finite_horizon import finite_horizon
-from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.finite_horizon import GainTable, finite_horizon
+from jaxbeam.numerics.stages import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled
 

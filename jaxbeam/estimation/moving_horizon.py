@@ -18,13 +18,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.estimator import AbstractSampledFilter
+from jaxbeam.case.controller import AbstractSampledFilter
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
 from jaxbeam.estimation.crossing_filter import CrossingFilter, corrected
 from jaxbeam.estimation.kalman import AbstractKalmanEstimator, Kalman
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition
-from jaxbeam.model.sensing.output_rows import modal_row
+from jaxbeam.model.output_rows import modal_row
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.numerics.qp import solve_qp
 from jaxbeam.runtime.arrays import Array, Number, cholesky, scan, solve_triangular, take, xp

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete
-from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.model.state_space import StateSpace
 from jaxbeam.runtime.arrays import Array, xp
 
 UNOBSERVABLE = 1e-9  # relative to the most observable mode; below, a mode is unobservable

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractContinuousFilter, AbstractSampledFilter, Estimate
+from jaxbeam.case.controller import AbstractContinuousFilter, AbstractSampledFilter, Estimate
 from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, in_blocks
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, take, xp

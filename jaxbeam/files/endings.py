@@ -1,11 +1,13 @@
-"""Endings of the files that results are written to, and the packages that write them.
+"""Endings of the files that results are written to, and optional packages, installed with extras.
 
 Nothing heavy is imported, so that the command line checks endings at once.
 """
 
+import importlib
 import importlib.util
 import os
 from pathlib import Path
+from types import ModuleType
 
 from jaxbeam.runtime.output_file import check_named
 
@@ -34,3 +36,14 @@ def check_ending(path: str | os.PathLike, content: str, allowed: tuple[str, ...]
             f"{ending} files need {package}, which is not installed: pip install {package}, or"
             " 'jaxbeam[tables]'"
         )
+
+
+def import_extra(name: str, extra: str) -> ModuleType:
+    """Import a library of an extra of jaxbeam. Raises ImportError, which says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(
+            f"{name} is not installed; install jaxbeam with the extra {extra!r}: "
+            f"pip install 'jaxbeam[{extra}]'"
+        ) from None

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from jaxbeam.case.case import part_classes
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
+    OF_QUANTITY,
     POSITIVE,
     PROBABILITY,
     axis_names,
@@ -14,9 +15,8 @@ from jaxbeam.case.fields import (
     kinds,
 )
 from jaxbeam.case.former_words import FILE_KEYS
-from jaxbeam.case.limits import MAX_COUNTS
 from jaxbeam.case.profiles.shapes import TableProfile
-from jaxbeam.case.quantities import OF_QUANTITY
+from jaxbeam.case.toml_file import MAX_COUNTS
 
 
 class Key(NamedTuple):

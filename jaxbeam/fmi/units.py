@@ -10,8 +10,7 @@ from pathlib import Path
 
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import save_case
-from jaxbeam.fmi.beam_steps import BeamSteps
-from jaxbeam.fmi.controller_steps import ControllerSteps
+from jaxbeam.fmi.steps import BeamSteps, ControllerSteps
 from jaxbeam.runtime.output_file import whole_file
 
 PARTS = {"beam": BeamSteps, "controller": ControllerSteps}

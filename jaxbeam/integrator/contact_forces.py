@@ -19,10 +19,8 @@ from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
 from jaxbeam.model.contact import solve_at_instants, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.numerics.peak_search import polynomial
-from jaxbeam.numerics.polynomials import lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, cond, fori_loop, is_jax, stop_gradient, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.numerics.polynomials import lagrange_coefficients, polynomial
+from jaxbeam.runtime.arrays import Array, Module, cond, fori_loop, is_jax, stop_gradient, take, xp
 
 ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
 # Peak nodes, and the middles between them.

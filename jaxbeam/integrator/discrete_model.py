@@ -14,15 +14,14 @@ from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, Propagators, 
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.deflection_lines import LoadInfluence
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.output_rows import (
+from jaxbeam.model.output_rows import (
     CorrectionRows,
     OutputRows,
     StaticCorrection,
     linear_outputs,
 )
 from jaxbeam.numerics.polynomials import lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, add_at, cholesky, solve_triangular, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, add_at, cholesky, solve_triangular, xp
 
 
 def monitored_rows(

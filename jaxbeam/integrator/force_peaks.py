@@ -28,7 +28,7 @@ from jaxbeam.integrator.force_system import (
 from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
+from jaxbeam.numerics.polynomials import estimate_peak, refine_peak
 
 
 class ForcePaths(NamedTuple):

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from numpy.polynomial import chebyshev
 
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.output_rows import LinearOutputs
+from jaxbeam.model.output_rows import LinearOutputs
 
 
 def product(left, right) -> np.ndarray:

@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import Array, cond, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, cond, take, xp
 
 
 class StepInfo(NamedTuple):

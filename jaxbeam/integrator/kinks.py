@@ -16,10 +16,9 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import kink_nodes
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.settlement import has_settlement
+from jaxbeam.model.transfer_matrices import has_settlement
 from jaxbeam.numerics.polynomials import slope_jumps
-from jaxbeam.runtime.arrays import Array, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, take, xp
 
 
 class KinkSteps(Module):

@@ -10,8 +10,7 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
-from jaxbeam.runtime.arrays import Array, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, take, xp
 
 
 class LoadPath(Module):

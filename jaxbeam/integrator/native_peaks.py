@@ -37,10 +37,9 @@ from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.output_rows import OutputRows, StaticCorrection, linear_outputs
-from jaxbeam.model.settlement import has_settlement
-from jaxbeam.numerics.peak_search import interpolation_matrix
-from jaxbeam.numerics.polynomials import lagrange_coefficients
+from jaxbeam.model.output_rows import OutputRows, StaticCorrection, linear_outputs
+from jaxbeam.model.transfer_matrices import has_settlement
+from jaxbeam.numerics.polynomials import interpolation_matrix, lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.native_library import Library
 

@@ -16,7 +16,7 @@ from jaxbeam.integrator.contact_forces import contact_minimum
 from jaxbeam.integrator.load_path import LoadPath
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.numerics.peak_search import (
+from jaxbeam.numerics.polynomials import (
     estimate_peak,
     locate_peak,
     max_with_ties,
@@ -25,6 +25,7 @@ from jaxbeam.numerics.peak_search import (
 )
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     cond,
     is_jax,
     optimization_barrier,
@@ -32,7 +33,6 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the largest of the samples around it
 

@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
+from jaxbeam.numerics.matrices import MAX_UNROLLED_TERMS
 from jaxbeam.numerics.polynomials import gauss_nodes, lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, cond, scan, set_at, stop_gradient, vmap, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, cond, scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jaxbeam.integrator.step_matrices import StepMatrices, advances_by_forces, share_matrices
 from jaxbeam.integrator.vehicles import StepInput, Vehicles, vehicle_maps
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
-from jaxbeam.numerics.batched_linalg import matvec
+from jaxbeam.numerics.matrices import matvec
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,

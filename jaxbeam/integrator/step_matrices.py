@@ -35,6 +35,7 @@ from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     any_jax,
     cond,
     is_jax,
@@ -43,7 +44,6 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
 MANY_STATES = 48  # from which NumPy makes no matrix of all states for a step

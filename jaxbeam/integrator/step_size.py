@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete, refuse_traced
-from jaxbeam.case.limits import MAX_SAMPLES
+from jaxbeam.case.toml_file import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits

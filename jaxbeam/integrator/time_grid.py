@@ -21,6 +21,7 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     any_jax,
     custom_jvp,
     is_jax,
@@ -31,7 +32,6 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 SAME_TIME_FRACTION = 1e-9  # of the duration: closer times are one event
 MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own

@@ -35,6 +35,7 @@ from jaxbeam.model.load_set import LoadSet, VehicleGroup
 from jaxbeam.numerics.polynomials import lagrange_coefficients
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     add_at,
     cond,
     is_jax,
@@ -45,7 +46,6 @@ from jaxbeam.runtime.arrays import (
     with_blocks,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 
 class VehiclePropagators(Module):

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from jaxbeam.case.beam import segment_edges
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import NODE_TOLERANCE, actuator_terms, node_positions
 from jaxbeam.model.load_set import load_set

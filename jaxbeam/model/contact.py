@@ -29,12 +29,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.model.linear_system import Signal
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.numerics.batched_linalg import solve_small
+from jaxbeam.numerics.matrices import solve_small
 from jaxbeam.runtime.arrays import (
     Array,
+    Module,
     add_at,
     any_jax,
     block_diag,
@@ -43,7 +43,6 @@ from jaxbeam.runtime.arrays import (
     slice_in_dim,
     xp,
 )
-from jaxbeam.runtime.module import Module
 
 CONCRETE_BLOCK = 2**14  # instants times wheels at once: fifty for 30 s take 0.1 GiB, not 0.9
 
@@ -435,25 +434,3 @@ def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None
         surface = surface + wheels.stiffness * motion[0].reshape(len(surface), -1)
     states = [group.initial_state(surface[group.wheels]) for group in wheels.vehicles]
     return xp.concatenate([part.reshape(-1, part.shape[-1]) for part in states])
-
-
-def vehicle_signals(loads: LoadSet) -> tuple[Signal, ...]:
-    """Names and units of the states of all vehicles: heights and pitch angles, then their rates.
-
-    That of a body of the first load is "load_0_body", in a row "load_0_vehicle_1_body", that of
-    the first absorber "absorber_0_body".
-    """
-    of_wheel, signals, count = loads.load_of_wheel, [], len(loads.trajectories) - loads.absorbers
-    for group in loads.wheels.vehicles:
-        for i in range(group.count):
-            vehicle = f"_vehicle_{i + 1}" if group.count > 1 else ""
-            number = of_wheel[group.first_wheel]
-            carried = f"load_{number}" if number < count else f"absorber_{number - count}"
-            prefix = f"{carried}{vehicle}"
-            names = [f"{prefix}_{name.replace(' ', '_')}" for name in group.names]
-            units = ["rad" if name.endswith("pitch") else "m" for name in group.names]
-            signals += [Signal(*pair) for pair in zip(names, units, strict=True)]
-            signals += [
-                Signal(f"{name}_rate", f"{unit}/s") for name, unit in zip(names, units, strict=True)
-            ]
-    return tuple(signals)

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.quantities import TWIST, TWIST_RATE
+from jaxbeam.case.fields import check_on_beam, concrete, is_concrete
+from jaxbeam.case.sensors import TWIST, TWIST_RATE
 from jaxbeam.case.track import Kernel
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
@@ -24,14 +23,17 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
-from jaxbeam.model.spread import spread_series, to_series
-from jaxbeam.model.theory.statics import SectionFlexibility
-from jaxbeam.model.theory.torsion import TwistFlexibility, twist_flexibility
-from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
-from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, add_at, is_numpy, set_at, solve, take, xp
+from jaxbeam.model.torsion import TwistFlexibility, twist_flexibility
+from jaxbeam.model.track import spread_series, to_series
+from jaxbeam.model.transfer_matrices import SectionFlexibility
+from jaxbeam.numerics.polynomials import (
+    chebyshev_polynomials,
+    estimate_peak,
+    piecewise_chebyshev,
+    refine_peak,
+)
+from jaxbeam.runtime.arrays import Array, Module, add_at, is_numpy, set_at, solve, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.module import Module
 
 # Positions on an interval between events that determine the deflection exactly there: eleven for a
 # cubic (flexibility) of a cubic (trajectory) times a table of forces, a polynomial of degree ten.

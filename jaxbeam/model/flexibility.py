@@ -16,11 +16,10 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.modes import assemble_matrices, section_properties, supported_matrices
-from jaxbeam.model.theory.statics import SectionFlexibility, is_held, section_flexibility
+from jaxbeam.model.transfer_matrices import SectionFlexibility, is_held, section_flexibility
 from jaxbeam.numerics.polynomials import piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, set_at, take, xp
+from jaxbeam.runtime.arrays import Array, Module, set_at, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.module import Module
 
 # Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.
 MIN_RIGID_BODY_STIFFNESS = 1e-10
@@ -121,7 +120,7 @@ def flexibility(
 ) -> Flexibility | SectionFlexibility:
     """Flexibility for unit forces at positions x (m), or for their x-derivatives.
 
-    Of a beam that is not uniform see `model.theory.statics`; of others, with nodal stiffness K,
+    Of a beam that is not uniform see `model.transfer_matrices`; of others, with nodal stiffness K,
     forces f of suspensions of stiffness k and their rows B:
 
     K u - B' f = load,  f = -k (B u + bending of the segment under the suspension).

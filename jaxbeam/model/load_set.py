@@ -20,9 +20,8 @@ from jaxbeam.case.loads.base import (
 from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractTrajectory, has_come
 from jaxbeam.model.layout import Layout
-from jaxbeam.model.settlement import surface
-from jaxbeam.runtime.arrays import Array, add_at, is_jax, is_numpy, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.model.transfer_matrices import surface
+from jaxbeam.runtime.arrays import Array, Module, add_at, is_jax, is_numpy, xp
 
 
 class VehicleGroup(Module):

@@ -14,11 +14,10 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
-from jaxbeam.model.spread import SpreadShapes, spread_series
+from jaxbeam.model.track import SpreadShapes, spread_series
 from jaxbeam.numerics.polynomials import piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, Module, block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.module import Module
 
 
 class ModalModel(Module):

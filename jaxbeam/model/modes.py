@@ -1,17 +1,18 @@
-"""Natural frequencies and mass-normalised mode shapes of a supported beam.
+"""Natural frequencies, mode shapes and damping of a supported beam; shapes are mass-normalised.
 
 One method serves every end condition, any number of spans, rigid and elastic supports and bonded
 patches: a Ritz expansion in polynomials of high degree, one series for each segment between
 supports and patch edges, with continuous deflection and slope. It converges faster than any power
-of the degree; frequencies have a relative error of about 1e-11. Rigid
-supports remove a degree of freedom instead of adding a penalty, and springs of any stiffness
-enter through a Cholesky factor, so neither costs accuracy. The problem is solved in beam units
-(length L, mass m L, stiffness E I / L^3), so beams that differ only in those share one solution.
-Beams that are not uniform have their elements in `model.theory`.
+of the degree; frequencies have a relative error of about 1e-11. Rigid supports remove a degree of
+freedom instead of adding a penalty, and springs of any stiffness enter through a Cholesky factor,
+so neither costs accuracy. The problem is solved in beam units (length L, mass m L, stiffness E I /
+L^3), so beams that differ only in those share one solution. Beams that are not uniform have their
+elements in `model.elements`.
 """
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -20,20 +21,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
+from jaxbeam.case.beam import MATERIALS, Beam
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
-from jaxbeam.case.quantities import NO_TORSION, SLOPE, TWIST, TWIST_RATE
+from jaxbeam.case.sensors import NO_TORSION, SLOPE, TWIST, TWIST_RATE
 from jaxbeam.case.validation import check_plant
-from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
-from jaxbeam.model.theory.damping import (
-    damping_of_ratios,
-    has_lossy_segments,
-    modal_damping,
-    ratios_of_segments,
-    safe_sqrt,
-)
-from jaxbeam.model.theory.elements import (
+from jaxbeam.model.elements import (
     MASS,
+    RIGIDITY,
+    SHEAR,
     FieldParts,
     Sections,
     assemble_sections,
@@ -41,15 +37,104 @@ from jaxbeam.model.theory.elements import (
     section_fields,
     sections,
 )
-from jaxbeam.model.theory.layers import layers
-from jaxbeam.model.theory.statics import check_buckling
-from jaxbeam.model.theory.torsion import TorsionMatrices, torsion_matrices, twists
+from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
+from jaxbeam.model.torsion import TorsionMatrices, torsion_matrices, twists
+from jaxbeam.model.track import layers
+from jaxbeam.model.transfer_matrices import check_buckling
 from jaxbeam.numerics.matrices import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, add_at, block_diag, set_at, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    Module,
+    add_at,
+    block_diag,
+    set_at,
+    stop_gradient,
+    take,
+    xp,
+)
 from jaxbeam.runtime.dataset import labelled_dataset
-from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.printer import TableViews
+
+FURTHER_POINTS = 8  # of the quadrature, for properties of degree up to 15
+
+Damping = tuple[Float[Array, " mode"], Float[Array, "mode mode"]]
+
+
+def safe_sqrt(square):
+    """Square root whose derivative at zero is zero."""
+    return xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
+
+
+def modal_damping(beam: Beam, values, coupling, span) -> Damping:
+    """Modal damping (1/s) of a beam without lossy segments, and that between repeated modes.
+
+    `values` and `coupling` (1/s^2) are the stiffness of the modes, `span` (m) the longest span, by
+    which the damping ratio of a bridge of a `material` is looked up. Rayleigh damping is a + b K.
+    """
+    if beam.rayleigh_damping is not None:
+        mass_factor, stiffness_factor = beam.rayleigh_damping
+        return mass_factor + stiffness_factor * values, stiffness_factor * coupling
+    ratio = beam.damping_ratio
+    if beam.loss_factor is not None:
+        ratio = beam.loss_factor / 2
+    if beam.material:
+        ratio = MATERIALS[beam.material].at(beam.length if span is None else span)
+    return damping_of_ratios(xp.broadcast_to(ratio, values.shape), values, coupling)
+
+
+def damping_of_ratios(ratios: Float[Array, " mode"], values, coupling) -> Damping:
+    """Modal damping of ratios, D = 2 zeta sqrt(K), and that between repeated modes.
+
+    Its derivative between repeated modes is that of the matrix square root.
+    """
+    omega = safe_sqrt(values)
+    sums = omega[:, None] + omega[None, :]
+    coupling_factor = xp.where(
+        sums > 0, (ratios[:, None] + ratios) / xp.where(sums > 0, sums, 1.0), 0.0
+    )
+    return 2 * ratios * omega, coupling_factor * coupling
+
+
+def has_lossy_segments(beam: Beam) -> bool:
+    """Whether a segment has a loss factor of its own."""
+    return any(segment.loss_factor is not None for segment in beam.segments)
+
+
+def ratios_of_segments(
+    beam: Beam, layout: Layout, sections: Sections, stiffness, fields: Callable
+) -> Float[Array, " mode"]:
+    """Damping ratios zeta_n = sum_s eta_s / 2 U_sn / U_n, by the strain energy of each segment s.
+
+    U_sn = 1/2 int (E I phi'^2 + kGA (w' - phi)^2) over the segment, with the loss factors eta_s of
+    the segments or else that of the beam; U_n = omega_n^2 / 2 is that of the whole mode of unit
+    mass, in which springs, foundation and axial force have no loss: the method of modal strain
+    energy of Johnson and Kienholz (1982), AIAA Journal 20. `stiffness` is omega^2 (1/s^2) and
+    `fields` are those of the modes. Patches count as the segments on which they are bonded.
+    """
+    losses = [
+        beam.loss_factor if segment.loss_factor is None else segment.loss_factor
+        for segment in beam.segments
+    ]
+    lost, length = xp.zeros(stiffness.shape), beam.length
+    for i, degree in enumerate(layout.degrees):
+        loss = losses[layout.segments[i]]
+        if loss is None:
+            continue
+        local, weights = np.polynomial.legendre.leggauss(degree + FURTHER_POINTS)
+        half = (sections.nodes[i + 1] - sections.nodes[i]) / 2
+        y = sections.nodes[i] + half * (local + 1)
+        slope, rotation, curvature = fields(y * length, (SLOPE, 1, 2))
+        properties = sections.in_element(i, local)
+        energy = properties[:, RIGIDITY, None] * curvature**2
+        if sections.shear_flexible:
+            shear = properties[:, SHEAR, None] / length**2 * (slope - rotation) ** 2
+            energy = energy + shear
+        lost = lost + loss * half * length * xp.sum(weights[:, None] * energy, axis=0)
+    elastic = stiffness > 0
+    fractions = lost * beam.bending_stiffness / xp.where(elastic, stiffness, 1.0)
+    return xp.where(elastic, fractions / 2, 0.0)
+
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -226,9 +311,9 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
 
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
     patches; suspensions of actuators and support dampers are left to the modal model. The equations
-    of beams that are not uniform are in `model.theory.elements`.
-    A beam with a torsional rigidity has modes of torsion among them (`model.theory.torsion`), one
-    under a track of layers those of beam and track together (`model.theory.layers`).
+    of beams that are not uniform are in `model.elements`.
+    A beam with a torsional rigidity has modes of torsion among them (`model.torsion`), one
+    under a track of layers those of beam and track together (`model.track`).
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`, for which the case is taken as valid.
 

@@ -14,19 +14,19 @@ from jaxtyping import Float
 from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
-from jaxbeam.case.quantities import TWIST, TWIST_RATE
+from jaxbeam.case.sensors import TWIST, TWIST_RATE
 from jaxbeam.model.deflection_lines import (
     residual_influence,
     static_deflection_per_port_force,
     unchecked_influence_line,
     validated_layout,
 )
+from jaxbeam.model.elements import rigidity_at
 from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
-from jaxbeam.model.theory.elements import rigidity_at
-from jaxbeam.model.theory.torsion import twists
+from jaxbeam.model.torsion import twists
 from jaxbeam.runtime.arrays import Array, is_numpy, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 

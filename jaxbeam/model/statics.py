@@ -12,9 +12,8 @@ from jaxtyping import Float
 
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete
-from jaxbeam.case.quantities import QUANTITIES, SIDES, SLOPE, quantity_of
+from jaxbeam.case.fields import check_on_beam, concrete, suggestion
+from jaxbeam.case.sensors import QUANTITIES, SIDES, SLOPE, quantity_of
 from jaxbeam.model.deflection_lines import (
     influence_functions,
     intervals_of_waves,
@@ -25,9 +24,9 @@ from jaxbeam.model.deflection_lines import (
     validated_layout,
 )
 from jaxbeam.model.layout import Layout, is_uniform
-from jaxbeam.model.sensing.output_rows import SIDE_DISTANCE, at_side, quantity_factor
-from jaxbeam.model.settlement import settlement_response
+from jaxbeam.model.output_rows import SIDE_DISTANCE, at_side, quantity_factor
 from jaxbeam.model.static_correction import section_stiffness
+from jaxbeam.model.transfer_matrices import settlement_response
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
+from jaxbeam.numerics.stages import balance
 from jaxbeam.runtime.arrays import Array, any_jax, custom_jvp, solve, stop_gradient, while_loop, xp
 
 MAX_DOUBLINGS = 60  # after which an equation is taken for unsolvable

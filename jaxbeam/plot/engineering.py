@@ -7,8 +7,8 @@ from matplotlib.figure import Figure, SubFigure
 from jaxbeam.analysis.assessment.assessment import Assessment
 from jaxbeam.analysis.sections import InfluenceTable
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.plot.schematic import draw_schematic
+from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.plot.drawing import draw_schematic
 from jaxbeam.plot.style import (
     COLOURS,
     GREY,

@@ -7,14 +7,13 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
-from jaxbeam.analysis.margins import loop_gain
-from jaxbeam.analysis.stability import FrozenPoles, Growth
+from jaxbeam.analysis.stability import FrozenPoles, Growth, loop_gain
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.frequency_responses import FrequencyResponse
 from jaxbeam.model.modes import Modes, modes as find_modes
-from jaxbeam.plot.schematic import draw_supports
+from jaxbeam.plot.drawing import draw_supports
 from jaxbeam.plot.style import (
     ALARM,
     FAINT,

@@ -1,12 +1,15 @@
-"""Closed loop of a case: its schedule of events, and the input policy of the integrator.
+"""Closed loop of a case: its schedule of events, and laws at samples and in continuous time.
 
-A controller with a sampling period acts at samples (`sampled_loop`), one without a period in
-continuous time (`continuous_loop`).
+A controller with a sampling period acts at multiples of it, on the readings available by then; its
+command begins a delay later and is held, while the beam moves continuously in between. One without
+a period acts in continuous time: its commands at the Gauss nodes of each step are found by Newton's
+method together with the states there.
 """
 
+import contextlib
 import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,22 +17,27 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
+from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.growth import load_amplitude
+from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.integrator.time_grid import (
     EventSchedule,
     Transmission,
     controller_schedule,
     moving_with_end,
 )
+from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.model.sensing.sensor_signals import (
+from jaxbeam.model.output_rows import OutputRows, sensor_rows
+from jaxbeam.model.sensor_signals import (
     COMMANDS,
     NO_DERIVATIVE,
+    filtered_reading,
+    initial_filter_state,
     noise_samples,
     refuse_derivatives,
     sensor_sections,
@@ -37,11 +45,290 @@ from jaxbeam.model.sensing.sensor_signals import (
     with_sensor_filters,
 )
 from jaxbeam.model.state_space import Plant, state_space
-from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    block_diag,
+    cond,
+    is_jax,
+    not_differentiated,
+    scan,
+    take,
+    vmap,
+    xp,
+)
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.simulation.commands import command_path
-from jaxbeam.simulation.continuous_loop import ContinuousLoop
-from jaxbeam.simulation.sampled_loop import SampledLoop
+from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
+from jaxbeam.simulation.commands import CommandMemory, CommandPath, command_path, limit_commands
+
+SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
+NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
+
+
+class ContinuousLoop(AbstractInputPolicy):
+    """Input policy of a law in continuous time; its memory holds the commands at the last node.
+
+    The model includes the analogue filters of sensors and law; its last states are the
+    `controller_states` of the law, and their rates the last of its commands. `implicit` is False
+    for open-loop commands, which do not depend on the state.
+    """
+
+    plant: Plant
+    law: AbstractContinuousLaw
+    model: ModalModel
+    output_rows: Float[Array, "output state"]
+    load_amplitude: Float[Array, " batch"]
+    implicit: bool = eqx.field(static=True)
+    controller_states: int = eqx.field(static=True)
+
+    def start(self, batch_size):
+        return xp.zeros((self.model.command_matrix.shape[1], batch_size))
+
+    def inputs(self, memory, state, info: StepInfo, states):
+        # In a step of no length, commands that jump at its start have jumped.
+        length = xp.maximum(info.length, SHORTEST_STEP * (1 + info.start))
+        times = info.start + length * GAUSS_NODES
+        if not self.implicit:
+            commands = self._open_loop_commands(times)[..., None]
+            commands = xp.broadcast_to(commands, (*commands.shape[:2], state.shape[-1]))
+            return commands, commands[-1]
+
+        def commands_for(commands):
+            of_batch = vmap(self._commands, in_axes=(-1, None), out_axes=-1)
+            return vmap(of_batch)(states(commands), times)
+
+        guess = xp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
+        commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
+        return commands, commands[-1]
+
+    def observe(self, memory, info):
+        return None
+
+    def failures(self, memory) -> Float[Array, " batch"]:
+        """Number of samples without a solution: none, as there are no samples."""
+        return xp.zeros(memory.shape[-1])
+
+    def commands_at(
+        self, states: Float[Array, "time state"], times: Float[Array, " time"]
+    ) -> Float[Array, "time command"]:
+        """Commands of a single run at some times (s): those to the actuators, then the rates."""
+        if not self.implicit:
+            return self._open_loop_commands(times)
+        if not any_jax(self, states, times):
+            with contextlib.suppress(NotVectorisedError):
+                return vectorised(self._commands)(states, times)
+        return vmap(self._commands)(states, times)
+
+    def _open_loop_commands(self, times):
+        """Commands of a law of time alone, (time, command): limits are applied to all at once."""
+        sensors, no_command = len(self.plant.case.sensors), xp.zeros(len(self.plant.case.actuators))
+        states = self.plant.modal_model.state_count
+        nothing = Measurement(xp.zeros(sensors), xp.zeros(states), no_command)
+        law_state = xp.zeros(0)
+        commands = vmap(lambda time: self.law.command(law_state, nothing, time))(times)
+        return limit_commands(self.plant.case, commands.T).T
+
+    def _commands(self, state, time):
+        """Commands and rates of the law's states, (command,), for the state of a run."""
+        state = state[: self.model.state_count]  # without those of vehicles
+        case, outputs = self.plant.case, self.output_rows @ state
+        sensors = len(case.sensors)
+        pairs = zip(case.sensors, outputs[:sensors], strict=True)
+        readings = [filtered_reading(sensor, None, None, value)[0] for sensor, value in pairs]
+        if outputs.shape[0]:
+            outputs = xp.stack([*readings, *outputs[sensors:]])  # filters of the law follow
+        law_state = state[state.shape[0] - self.controller_states :]
+        plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
+        measurement = Measurement(outputs, plant_state, xp.zeros(len(case.actuators)))
+        command = limit_commands(case, self.law.command(law_state, measurement, time))
+        rates = self.law.rates(law_state, measurement, command, time)
+        return xp.concatenate([command, rates])
+
+
+def newton_fixed_point(
+    function, guess: Float[Array, "*shape batch"], iterations: int
+) -> Float[Array, "*shape batch"]:
+    """Fixed point of a function by Newton's method, for each entry of a batch by itself."""
+    batch_size = guess.shape[-1]
+    size = guess.size // batch_size
+    unit_vectors = xp.broadcast_to(xp.eye(size)[..., None], (size, size, batch_size))
+
+    def iterate(value, _):
+        function_value, derivative = jax.linearize(function, value)
+        slopes = vmap(derivative)(unit_vectors.reshape(size, *guess.shape)).reshape(
+            unit_vectors.shape
+        )
+        residual = (function_value - value).reshape(size, batch_size)
+        step = xp.linalg.solve((unit_vectors - slopes).T, residual.T[..., None])
+        return value + step[..., 0].T.reshape(guess.shape), None
+
+    return scan(iterate, guess, length=iterations)[0]
+
+
+class LoopMemory(NamedTuple):
+    """Memory of a sampled loop, batch axis last.
+
+    State of the law, commands on their way, states of the digital filters, latest readings and
+    those not available yet (newest first), and the number of samples at which the law found no
+    solution.
+    """
+
+    law_state: Any
+    commands: CommandMemory
+    filter_states: list
+    readings: Float[Array, "age sensor batch"]
+    failures: Float[Array, " batch"]
+
+
+class SampledLoop(AbstractInputPolicy):
+    """Input policy of a sampled law: one law for all runs of a batch, a memory for each.
+
+    The model includes the analogue filters of the sensors; `filter_sections` are those of the
+    digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
+    the forces too; None without accelerations. `path` is the way of the commands.
+    """
+
+    plant: Plant
+    law: AbstractSampledLaw
+    model: ModalModel
+    output_rows: Float[Array, "sensor state"]
+    measured_rows: OutputRows | None
+    load_amplitude: Float[Array, " batch"]
+    loads: LoadSet
+    schedule: EventSchedule
+    filter_sections: tuple
+    path: CommandPath
+    noise: Float[Array, "sample sensor"] | None
+    implicit: bool = eqx.field(static=True, default=False)
+    holds_commands: ClassVar[bool] = True
+
+    def start(self, batch_size):
+        sensors, zero = self.plant.case.sensors, xp.zeros(batch_size)
+        pairs = list(zip(sensors, self.filter_sections, strict=True))
+        filter_states = [initial_filter_state(sensor, part, zero) for sensor, part in pairs]
+        readings = [
+            filtered_reading(*pair, state, zero)[0]
+            for pair, state in zip(pairs, filter_states, strict=True)
+        ]
+        readings = xp.stack(readings) if readings else xp.zeros((0, batch_size))
+        return LoopMemory(
+            _broadcast_to_batch(self.law.initial_state(), batch_size),
+            self.path.start(batch_size, self.schedule.max_waiting),
+            filter_states,
+            xp.broadcast_to(readings, (self.schedule.max_age + 1, *readings.shape)),
+            zero,
+        )
+
+    def inputs(self, memory: LoopMemory, state, info: StepInfo, states):
+        memory = cond(
+            info.event >= 0,
+            lambda memory: self._process_event(memory, state, info),
+            lambda memory: memory,
+            memory,
+        )
+        acting = self.path.acting(memory.commands)
+        return xp.broadcast_to(acting, (NODE_COUNT, *acting.shape)), memory
+
+    def observe(self, memory, info):
+        """Available readings (sensor, batch), and number of failures of the law (batch).
+
+        And the commands (actuator, batch) where they act through hysteresis or creep, else None.
+        """
+        through_operator = any(one is not None for one in self.path.operators)
+        sent = memory.commands.command if through_operator else None
+        return self._available_readings(memory.readings, info.event), memory.failures, sent
+
+    def failures(self, memory) -> Float[Array, " batch"]:
+        """Number of samples at which the law found no solution, up to the end of the run."""
+        return memory.failures
+
+    def _process_event(self, memory, state, info):
+        """Memory after an event: samples of sensors, a step of the law, a command that begins."""
+        schedule, event = self.schedule, info.event
+        filter_states, readings = self._sample_sensors(memory, state, info)
+
+        def step(inputs):
+            law_state, commands, failures = inputs
+            available = self._available_readings(readings, event)
+            acting = self.path.assumed_commands(commands, schedule.assumed_age)
+            command, law_state, solved = self._step_law(law_state, available, state, acting, info)
+            return law_state, self.path.send(commands, command), failures + ~solved
+
+        law_state, commands, failures = cond(
+            take(schedule.control_sample, event) >= 0,
+            step,
+            lambda inputs: inputs,
+            (memory.law_state, memory.commands, memory.failures),
+        )
+        commands = self.path.begin(commands, take(schedule.command_age, event))
+        return LoopMemory(law_state, commands, filter_states, readings, failures)
+
+    def _sample_sensors(self, memory, state, info):
+        """Filter states and readings after the samples that are due at an event."""
+        readings, filter_states, histories = memory.readings, [], []
+        signals = cond(
+            xp.any(take(self.schedule.reading, info.event) >= 0),
+            lambda state: self._sensor_inputs(state, self.path.acting(memory.commands), info.start),
+            lambda state: xp.zeros((self.output_rows.shape[0], state.shape[1])),
+            state,
+        )
+        for i, sensor in enumerate(self.plant.case.sensors):
+            number = take(self.schedule.reading, (info.event, i))
+            if not is_jax(number) and number < 0:
+                filter_states.append(memory.filter_states[i])
+                histories.append(readings[:, i])
+                continue
+            noise = None if self.noise is None else take(self.noise, (number, i))
+            reading, filter_state = filtered_reading(
+                sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise
+            )
+            due = number >= 0
+            filter_states.append(_tree_where(due, filter_state, memory.filter_states[i]))
+            shifted = xp.concatenate([reading[None], readings[:-1, i]])
+            histories.append(_tree_where(due, shifted, readings[:, i]))
+        return filter_states, xp.stack(histories, axis=1) if histories else readings
+
+    def _available_readings(self, readings, event):
+        """Latest readings (sensor, batch) that are available at an event."""
+        ages = [take(self.schedule.reading_age, (event, i)) for i in range(readings.shape[1])]
+        latest = [take(readings, (age, i)) for i, age in enumerate(ages)]
+        return xp.stack(latest) if latest else readings[0]
+
+    def _sensor_inputs(self, state, command, time):
+        """Inputs of the sensors (sensor, batch) at a time (s)."""
+        signals = self.output_rows @ state[: self.model.state_count]
+        if self.measured_rows is None:
+            return signals
+        contact = contact_at(self.model, self.loads, time, state, command)
+        return self.measured_rows.with_accelerations(signals, contact.modal_acceleration)
+
+    def _step_law(self, law_state, readings, state, command, info):
+        """Step of the law for each run of the batch."""
+        missing = self.schedule.missing
+        present = None if missing is None else ~take(missing, info.event)
+
+        def step(law_state, *measured):
+            measurement = Measurement(*measured)._replace(present=present)
+            return self.law.step(law_state, measurement, info.start)
+
+        plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
+        return vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)
+
+
+def _broadcast_to_batch(state, batch_size: int):
+    """The same state for each run, along a new last axis."""
+    return jax.tree.map(
+        lambda leaf: xp.broadcast_to(xp.asarray(leaf)[..., None], (*xp.shape(leaf), batch_size)),
+        state,
+    )
+
+
+def _tree_where(condition, new, old):
+    """Numbers of one tree or of another with the same structure."""
+    if not is_jax(condition):
+        return new if condition else old
+    return jax.tree.map(lambda a, b: xp.where(condition, a, b), new, old)
+
 
 SAME_TIME_FRACTION = 1e-9  # of a period
 MOVING = "period", "delay", "sampling_period", "jitter", "times"  # numbers that move events

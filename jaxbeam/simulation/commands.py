@@ -7,9 +7,16 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.case import Case
-from jaxbeam.model.sensing.sensor_signals import ROUNDED
-from jaxbeam.runtime.arrays import Array, is_jax, not_differentiated, stop_gradient, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.model.sensor_signals import ROUNDED
+from jaxbeam.runtime.arrays import (
+    Array,
+    Module,
+    is_jax,
+    not_differentiated,
+    stop_gradient,
+    take,
+    xp,
+)
 
 CommandRanges = tuple[Float[Array, " actuator"], ...]
 

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES, TWIST, quantity_of
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.sensors import QUANTITIES, TWIST, Sensor, quantity_of
 from jaxbeam.integrator.peaks import Peaks, RunningPeaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_size import UNSAMPLED, StepTrial, trial_positions
@@ -16,10 +15,10 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import band_weights, place_of, sensor_history, sensor_row
+from jaxbeam.model.output_rows import band_weights, place_of, sensor_history, sensor_row
 from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
-from jaxbeam.simulation.motion import motion_at
+from jaxbeam.simulation.section_forces import motion_at
 
 
 class Extremes(NamedTuple):

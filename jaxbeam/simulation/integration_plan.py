@@ -20,7 +20,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.limits import MAX_SAMPLED, MAX_SAMPLES
+from jaxbeam.case.toml_file import MAX_SAMPLED, MAX_SAMPLES
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.inputs import AbstractInputPolicy, HeldCommands
@@ -45,9 +45,8 @@ from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample
 from jaxbeam.model.layout import largest_layout
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.runtime.arrays import Array, any_jax, xp
+from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.closed_loop import closed_loop, loop_of_case, loop_schedule, moves_events
 from jaxbeam.simulation.errors import step_errors
 

@@ -7,7 +7,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.load_set import LoadSet
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Module
 
 MAX_LISTED = 4  # wheels in a sentence
 ROUNDING = 1e-12  # of a given force

@@ -22,14 +22,14 @@ from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid, event_places, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.plausibility.check import warn_if_implausible
-from jaxbeam.model.sensing.output_rows import (
+from jaxbeam.model.output_rows import (
     corrected_places,
     sensor_history,
     sensor_rows,
     static_correction,
 )
-from jaxbeam.model.sensing.sensor_signals import (
+from jaxbeam.model.plausibility.check import warn_if_implausible
+from jaxbeam.model.sensor_signals import (
     VehicleMotion,
     relative_to_beam,
     sensor_readings,
@@ -63,8 +63,8 @@ from jaxbeam.simulation.integration_plan import (
     times_of_samples,
 )
 from jaxbeam.simulation.labels import Flights
-from jaxbeam.simulation.motion import motion_at
 from jaxbeam.simulation.record import Record, Result
+from jaxbeam.simulation.section_forces import motion_at
 from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 
 MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough
@@ -148,7 +148,7 @@ def _simulate_lifting(case: Case, times, plan: IntegrationPlan | None, tolerance
 
     Raises ValueError for a run that is traced or has a `plan`, RuntimeError if no runs agree.
     """
-    from jaxbeam.simulation import unilateral_record as lifting  # late: few runs need it
+    from jaxbeam.simulation import unilateral as lifting  # late: few runs need it
 
     if plan is not None or any_jax(case, times):
         raise ValueError(ONE_RUN)
@@ -171,8 +171,7 @@ def _simulate_lifting(case: Case, times, plan: IntegrationPlan | None, tolerance
 
 def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integration":
     """Unilateral run of a case by a plan for `held`, the case with bilateral contact."""
-    from jaxbeam.simulation.unilateral import run_unilateral
-    from jaxbeam.simulation.unilateral_record import motion_at_samples, peaks_of_run
+    from jaxbeam.simulation.unilateral import motion_at_samples, peaks_of_run, run_unilateral
 
     monitored = monitored_sensors(case.sensors)
     setup = integration_setup(held, plan, times, monitored)

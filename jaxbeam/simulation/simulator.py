@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.runtime.arrays import Array, any_traced, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, any_traced, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import plan_of_peaks, simulate_planned

@@ -18,14 +18,13 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
-from jaxbeam.files.interactive import interactive_page
 from jaxbeam.files.netcdf import write_netcdf
+from jaxbeam.files.report import interactive_page
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
-from jaxbeam.runtime.arrays import Array, any_traced
+from jaxbeam.runtime.arrays import Array, Module, any_traced
 from jaxbeam.runtime.dataset import labelled_dataset
-from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, html_table, text_table
 from jaxbeam.simulation.errors import Extremes

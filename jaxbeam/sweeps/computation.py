@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, address_words, unit_at
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset

@@ -34,7 +34,7 @@ from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import (
+from jaxbeam.model.output_rows import (
     corrected_places,
     linear_outputs,
     sensor_rows,

@@ -39,7 +39,7 @@ from jaxbeam.integrator.time_grid import (
 )
 from jaxbeam.model.load_set import LoadSet, load_set, wheel_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.sensing.output_rows import (
+from jaxbeam.model.output_rows import (
     OutputRows,
     StaticCorrection,
     corrected_places,

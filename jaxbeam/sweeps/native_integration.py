@@ -1,7 +1,7 @@
 """Integration of the batches of a sweep in C: inputs of the integrator, and sampled loops in C.
 
 The inputs of batches that share a model are made in NumPy, without a compiler. The events of a
-sampled loop are the functions of `sampled_loop`, traced and translated (`runtime/c_translation`),
+sampled loop are the functions of `closed_loop`, traced and translated (`runtime/c_translation`),
 for eight runs at once. Numbers of the loop are arguments, so that loops of one structure use the
 same compiled code.
 """
@@ -36,8 +36,8 @@ from jaxbeam.integrator.time_grid import (
 from jaxbeam.model.load_set import LoadSet, WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import corrected_places
-from jaxbeam.model.sensing.sensor_signals import with_sensor_filters
+from jaxbeam.model.output_rows import corrected_places
+from jaxbeam.model.sensor_signals import with_sensor_filters
 from jaxbeam.model.state_space import build_plant
 from jaxbeam.runtime.c_translation import Translation
 from jaxbeam.runtime.c_writer import (
@@ -52,8 +52,7 @@ from jaxbeam.runtime.c_writer import (
 from jaxbeam.runtime.native_library import Library
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
-from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.simulation.sampled_loop import LoopMemory, SampledLoop
+from jaxbeam.simulation.closed_loop import LoopMemory, SampledLoop, closed_loop
 from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, evenly_spaced, values_at, with_few_runs
 from jaxbeam.sweeps.integration import Outputs, Program, outputs_of
 from jaxbeam.sweeps.step_size import PathEvents

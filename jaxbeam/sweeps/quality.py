@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace, structure_of
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator.static_shapes import longest_stable_step, max_concurrent_loads
 from jaxbeam.integrator.step_size import check_step_count, trial_run, without_later_vibration
 from jaxbeam.model.deflection_lines import unchecked_influence_line
@@ -21,7 +21,7 @@ from jaxbeam.model.static_correction import is_supported, modal_influence_line
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.simulation.errors import truncation_changes
-from jaxbeam.simulation.motion import motion_at, motion_of_forces
+from jaxbeam.simulation.section_forces import motion_at, motion_of_forces
 
 if TYPE_CHECKING:
     import xarray

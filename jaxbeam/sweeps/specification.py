@@ -26,13 +26,11 @@ from jaxbeam.case.case import (
     unit_at,
 )
 from jaxbeam.case.contact import ONE_RUN
-from jaxbeam.case.declared_checks import describe_value
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, describe_value
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.shapes import AbstractProfile
-from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.case.reading.units import in_si
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.sensors import QUANTITIES, Sensor
+from jaxbeam.case.toml_file import in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks

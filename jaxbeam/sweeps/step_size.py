@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.profiles.spectra import AbstractSpectralProfile
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator.integrate import longest_force_step
 from jaxbeam.integrator.time_grid import LoadEvents
 from jaxbeam.model.load_set import load_set

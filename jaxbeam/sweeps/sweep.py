@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.fields import OUTSIDE, refuses_traced
-from jaxbeam.case.reading.units import in_si
+from jaxbeam.case.toml_file import in_si
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible_sweep
 from jaxbeam.runtime.interrupts import keeping

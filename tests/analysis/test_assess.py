@@ -14,17 +14,18 @@ from jaxbeam.analysis.assessment.assessment import (
     running_factor,
     static_dynamic_factor,
 )
-from jaxbeam.analysis.assessment.high_speed import reaction_peaks, train_response
-from jaxbeam.analysis.assessment.static_checks import (
+from jaxbeam.analysis.assessment.checks import (
     CheckedSection,
+    checked_sections,
     largest_under_lm71,
     largest_under_train,
+    reaction_peaks,
     tabulated_line,
+    train_response,
 )
-from jaxbeam.analysis.assessment.train_checks import checked_sections
 from jaxbeam.analysis.sections import characteristic_points
 from jaxbeam.library.published import trains
-from jaxbeam.model.sensing.output_rows import counted_frequency
+from jaxbeam.model.output_rows import counted_frequency
 from tests.modules import ROOT
 
 DATA = json.loads((ROOT / "tests" / "data" / "railway_code.json").read_text())

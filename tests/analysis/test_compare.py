@@ -18,7 +18,7 @@ from jaxbeam.analysis.compare import (
     metrics_over_cases,
     worst_comparison,
 )
-from jaxbeam.analysis.margins import LOAD_POSITIONS, stability_margin
+from jaxbeam.analysis.stability import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.loop_faults import FAULTS, FaultedPeak, compare_under_faults
+from jaxbeam.analysis.compare import FAULTS, FaultedPeak, compare_under_faults
 from jaxbeam.cli import main
 
 FORCE = 4.0  # N
@@ -137,7 +137,7 @@ def test_laws_in_continuous_time_lose_no_samples():
 
 
 def test_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxbeam.analysis.loop_faults.compare_under_faults", _of_one_run)
+    monkeypatch.setattr("jaxbeam.analysis.compare.compare_under_faults", _of_one_run)
     jb.save_case(strip(controller=FEEDBACK), tmp_path / "case.toml")
     law = "[controller]\nkind = 'feedback'\ngains = [-400.0]\nperiod = 0.01\n"
     (tmp_path / "wrong.toml").write_text(law)

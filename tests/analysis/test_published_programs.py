@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.frozen_loop import NotAffineError, affine_jacobian
-from jaxbeam.numerics.discretisation import exponential_times, propagate
+from jaxbeam.numerics.stages import exponential_times, propagate
 from tests.modules import ROOT
 
 PUBLISHED = json.loads((ROOT / "tests" / "data" / "published_programs.json").read_text())

@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 import jaxbeam as jb
-from jaxbeam.analysis.run_up import decay_rates, run_up, with_run_up
+from jaxbeam.analysis.critical_speeds import decay_rates, run_up, with_run_up
 from jaxbeam.cli.commands.sweep import _with_run_up
 
 CAR = jb.QuarterCar(

@@ -21,20 +21,20 @@ from jaxbeam.analysis.linearised_loop import (
     linearised_loop,
     loop_timing,
 )
-from jaxbeam.analysis.margins import margins
 from jaxbeam.analysis.stability import (
     _assignment,
     _tracked_branches,
     frozen_poles,
     growth,
+    margins,
     stability_limit,
     stream,
 )
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
-from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.crossing_gains import GainSchedule
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.finite_horizon import GainTable
 from tests.differences import central
 from tests.modules import DATA
 

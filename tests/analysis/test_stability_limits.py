@@ -11,14 +11,15 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.limit_cycles import command_oscillations, count_oscillations, turning_points
+from jaxbeam.analysis.compare import command_oscillations, count_oscillations, turning_points
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.analysis.margins import margins, stability_margin
 from jaxbeam.analysis.stability import (
     LoadStabilityLimits,
     frozen_poles,
     growth,
     load_stability_limits,
+    margins,
+    stability_margin,
     stream,
     stream_excess,
 )

@@ -17,8 +17,8 @@ import pytest
 import uvicorn
 
 import jaxbeam as jb
+from jaxbeam.app.questions import KINDS
 from jaxbeam.app.server import HEADERS, MAX_BYTES, application
-from jaxbeam.app.take_away import KINDS
 from tests.app.conftest import RIG
 
 TOKEN = "a-token-of-the-tests"

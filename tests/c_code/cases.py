@@ -9,15 +9,15 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.control.crossing_gains import GainSchedule, PositionGainLaw, ScheduledGainLaw
 from jaxbeam.control.feedback import Feedback, OutputFeedback, ScheduledFeedback
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.control.optimal.crossing_gains import GainSchedule, PositionGainLaw, ScheduledGainLaw
-from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.predictive.prediction import Preview, SampledPlant
+from jaxbeam.control.lqr import LQR
+from jaxbeam.control.prediction import Preview, SampledPlant
 from jaxbeam.control.state_controller import SampledStateLaw, TrueState
 from jaxbeam.estimation.sampled_plant import sample_timing
-from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.finite_horizon import GainTable
 
 # Laws with random tables, and of plants that vary, whose designs take no compilation.
 

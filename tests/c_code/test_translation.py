@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 from numpy.testing import assert_allclose
 
-from jaxbeam.c_code.texts import BY_PRECISION, array_text
+from jaxbeam.c_code.program import BY_PRECISION, array_text
 from jaxbeam.c_code.translation import (
     ProgramWriter,
     functions_of,

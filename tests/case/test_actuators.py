@@ -13,14 +13,14 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
+from jaxbeam.analysis.sections import coil_history
 from jaxbeam.case.case import addresses, replace
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.frequency_responses import frequency_response
-from jaxbeam.model.linear_system import poles
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.state_space import poles
 from jaxbeam.runtime.arrays import xp
-from jaxbeam.simulation.derived_histories import coil_history
 from tests.differences import central
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from jaxbeam.case.filters import (
+from jaxbeam.case.sensors import (
     Filter,
     analogue_state_space,
     analogue_steady_state,
@@ -16,7 +16,7 @@ from jaxbeam.case.filters import (
     second_order_sections,
     steady_filter_state,
 )
-from jaxbeam.numerics.discretisation import c2d
+from jaxbeam.numerics.stages import c2d
 from tests.differences import central
 
 ORDERS = [1, 2, 3, 5, 10]

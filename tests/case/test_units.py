@@ -15,7 +15,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import address_words, part_classes, unit_at, value_words
 from jaxbeam.case.display import unit_scale, with_prefix
 from jaxbeam.case.fields import kinds
-from jaxbeam.case.reading.units import in_si, is_quantity
+from jaxbeam.case.toml_file import in_si, is_quantity
 from jaxbeam.files.case_file import case_from_dict
 
 # Exact by definition: BIPM, The International System of Units (2019), and NIST SP 811, appendix B.

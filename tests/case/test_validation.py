@@ -27,9 +27,9 @@ from jaxbeam.case.case import (
     unit_at,
     value_at,
 )
-from jaxbeam.case.limits import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
 from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.toml_file import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
 from jaxbeam.case.trajectory import NEVER, BrakingTrajectory, TabulatedTrajectory
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import Feedback

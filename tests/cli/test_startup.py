@@ -58,7 +58,7 @@ def test_nothing_heavy_is_imported(folder, line):
 
 def test_a_record_and_a_picture_need_no_package_that_takes_as_long_as_the_run(folder):
     slow = ("xarray", "pandas", "dask", "scipy.signal", "scipy.optimize", "matplotlib.pyplot")
-    slow += ("jaxbeam.control.predictive.mpc", "jaxbeam.estimation.kalman")  # kinds of no part
+    slow += ("jaxbeam.control.mpc", "jaxbeam.estimation.kalman")  # kinds of no part
     code = (
         "import json, sys\n"
         "from jaxbeam.cli import main\n"

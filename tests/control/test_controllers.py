@@ -16,7 +16,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.closed_loop import loop_schedule

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.analysis.margins import stability_margin
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.analysis.stability import stability_margin
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 
 PAGE = Path(__file__).parents[2] / "docs/howto/controllers.md"

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.bound.least_integral import least_integral
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.files.export.designed import export_gains
 from tests.c_code.cases import CASES, rig as passive_rig
 

@@ -6,8 +6,7 @@ import scipy.integrate
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, sample_times, static_shapes

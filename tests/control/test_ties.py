@@ -12,10 +12,10 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
+from jaxbeam.control.crossing_gains import GainSchedule
 from jaxbeam.control.load_identification import GateIdentifier
-from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.model.load_set import load_set
-from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.finite_horizon import GainTable
 
 PERIODS = [Fraction(1, 10), Fraction(1, 3), Fraction(1, 30), Fraction(7, 1000)]
 LENGTH, SPEED = Fraction(6, 10), Fraction(7)

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.inversion import Inversion
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer

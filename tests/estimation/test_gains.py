@@ -12,12 +12,12 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observability import DetectabilityWarning
 from jaxbeam.estimation.observer import kalman_gain, placed_gain, sampled_kalman_gain
 from jaxbeam.estimation.sampled_plant import SampleTiming, sample_timing
-from jaxbeam.numerics.discretisation import balance
+from jaxbeam.numerics.stages import balance
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central

@@ -11,10 +11,9 @@ from scipy.stats import chi2
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate, EstimatedLoads
+from jaxbeam.case.controller import Estimate, EstimatedLoads, Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer
 from jaxbeam.estimation.sampled_plant import sample_timing

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.inversion import Inversion
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observability import ConditioningWarning, conditioning

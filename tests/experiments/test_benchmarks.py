@@ -23,13 +23,13 @@ from experiments.benchmarks import (
     trains,
 )
 from experiments.benchmarks.common import import_optional
-from experiments.benchmarks.computing_time import (
+from experiments.benchmarks.controller_steps import (
     MAX_STEPS,
     computing_times,
+    patch_case,
     sample_indices,
     time_steps,
 )
-from experiments.benchmarks.controller_steps import patch_case
 from experiments.benchmarks.first_answer import AXLES, ROWS, Row, train
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 
@@ -70,7 +70,7 @@ def test_packages_that_are_not_installed_are_none():
         (1, "sampled", "histories"),
     ],
 )
-@pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampled_lqr.SamplingWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.control.sampled_lqr.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_fully_measured(kind):
     row = cases.measure(*kind, modes=2, side=2)
     assert row["error"] < 1e-6 and row["scipy_error"] < 1e-6

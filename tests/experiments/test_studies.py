@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from experiments.studies import (
     fragility,
-    hand_set,
     sensor_feedback,
     tune_feedforward,
     tune_sensor_feedback,
@@ -115,7 +114,7 @@ def test_errors(arguments, message):
 
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_hand_set_laws_stay_within_the_limits(rig):
-    law, table = hand_set.trapezium(rig), hand_set.drawn_table(rig)
+    law, table = tuned_feedforward.trapezium(rig), tuned_feedforward.drawn_table(rig)
     low, high = COMMAND_LIMITS
     for values in (law.values, table.values):
         assert values.min() >= low and values.max() == high
@@ -123,7 +122,7 @@ def test_hand_set_laws_stay_within_the_limits(rig):
 
 
 def test_trapezium_of_rig_b_has_the_four_numbers():
-    law = hand_set.trapezium("B")
+    law = tuned_feedforward.trapezium("B")
     np.testing.assert_allclose(law.shares, [0, 0.2, 0.9, 1])
     np.testing.assert_allclose(law.values, [[0, 7.5, 7.5, 0]])
 
@@ -132,7 +131,7 @@ def test_trapezium_of_rig_b_has_the_four_numbers():
 def test_a_misplaced_gate_makes_the_load_seem_faster_or_slower(error):
     """Commands over time against the table at the position that the gates suggest."""
     case = fragility.standard_case(rigs.load("B"))
-    law = hand_set.trapezium("B")
+    law = tuned_feedforward.trapezium("B")
     case = fragility.with_gate_error(dataclasses.replace(case, controller=law), error)
     designed = case.controller.law(jb.state_space(case))
     entry, gate = fragility.HELD_OUT_ENTRY_TIME, float(law.gates[1])

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from experiments.validation import random_cases
 from experiments.validation.__main__ import check_groups
-from experiments.validation.expected_gain import expected_gain
+from experiments.validation.checks import Check, validation_page
 from experiments.validation.least_errors import (
     TELLING_GAIN,
+    expected_gain,
     least_errors,
     least_errors_of_decays,
     least_errors_of_forced,
@@ -19,9 +21,7 @@ from experiments.validation.least_errors import (
 )
 from experiments.validation.modal_methods import PYOMA, ours, pyoma, table
 from experiments.validation.modal_setups import HEADER, REFERENCES, assess, planted_setups
-from experiments.validation.page import Check, validation_page
-from experiments.validation.random_cases import __main__ as random_cases
-from experiments.validation.random_cases.checks import (
+from experiments.validation.random_cases import (
     Errors,
     Outcome,
     TooLongError,

@@ -21,7 +21,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.lqr import LQR
 from jaxbeam.files.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.model.modes import mesh_layout
 

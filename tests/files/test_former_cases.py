@@ -18,7 +18,7 @@ import jaxbeam as jb
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import KindChangeWarning, with_settings
 from jaxbeam.files.export import export_gains, read_gains
-from jaxbeam.files.export.gains import ARRAYS
+from jaxbeam.files.export.designed import ARRAYS
 from jaxbeam.simulation.stored_record import read_record
 from tuning import load_fit, read_logs
 

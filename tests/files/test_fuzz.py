@@ -11,7 +11,7 @@ import tomli_w
 from hypothesis import HealthCheck, assume, example, given, settings, strategies as st
 
 from jaxbeam.case.case import part_classes
-from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.controller import AbstractEstimator
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case, save_case

@@ -22,7 +22,6 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.cli import main
 from jaxbeam.files.endings import RESULTS, TABLES, check_ending
-from jaxbeam.files.matrices import write_state_space
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.report import (
     ReportFigure,
@@ -33,7 +32,13 @@ from jaxbeam.files.report import (
     markdown,
     write_report,
 )
-from jaxbeam.files.tables import as_text_cell, from_text_cell, sweep_columns, write_table
+from jaxbeam.files.tables import (
+    as_text_cell,
+    from_text_cell,
+    sweep_columns,
+    write_state_space,
+    write_table,
+)
 
 CASE = jb.Case(
     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),

@@ -14,7 +14,7 @@ from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import corrected_places, sensor_rows, static_correction
+from jaxbeam.model.output_rows import corrected_places, sensor_rows, static_correction
 
 BEAM = jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3)
 RUN = jb.Run(0.5, sample_rate=100.0)

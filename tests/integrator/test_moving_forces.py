@@ -12,9 +12,9 @@ from jaxbeam.integrator.force_system import force_responses, force_system, parti
 from jaxbeam.integrator.step_size import without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import linear_outputs, sensor_rows
+from jaxbeam.model.output_rows import linear_outputs, sensor_rows
 from jaxbeam.numerics.polynomials import piecewise_chebyshev
-from jaxbeam.simulation.motion import outputs_of_forces
+from jaxbeam.simulation.section_forces import outputs_of_forces
 from jaxbeam.sweeps.force_runner import _systems, force_runner
 from jaxbeam.sweeps.quality import SAMPLES, WorstRun, estimated_errors
 from jaxbeam.sweeps.specification import sweep_specification

@@ -20,8 +20,8 @@ import jaxbeam as jb
 from jaxbeam.cli import main
 from jaxbeam.integrator import contact_forces, native_peaks, peaks, propagators, step_matrices
 from jaxbeam.integrator.propagators import PEAK_NODES
-from jaxbeam.numerics import peak_search
-from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
+from jaxbeam.numerics import polynomials
+from jaxbeam.numerics.polynomials import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
 from jaxbeam.sweeps import blocks
 from jaxbeam.sweeps.specification import sweep_specification
@@ -259,11 +259,11 @@ def test_constants_are_those_of_the_c_code():
         "SPREAD_FACTOR": contact_forces.spread_factor(),
         "PEAK_MARGIN": peaks.PEAK_MARGIN,
         "END_PEAK_MARGIN": margin,
-        "NEWTON_STEP_LIMIT": peak_search.newton_step_limit(PEAK_NODES),
-        "ESTIMATE_ITERATIONS": peak_search.ESTIMATE_ITERATIONS,
-        "START_POINTS": peak_search.START_POINTS,
-        "NEWTON_ITERATIONS": peak_search.NEWTON_ITERATIONS,
-        "TIE_TOLERANCE": peak_search.TIE_ROUNDING_UNITS * sys.float_info.epsilon,
+        "NEWTON_STEP_LIMIT": polynomials.newton_step_limit(PEAK_NODES),
+        "ESTIMATE_ITERATIONS": polynomials.ESTIMATE_ITERATIONS,
+        "START_POINTS": polynomials.START_POINTS,
+        "NEWTON_ITERATIONS": polynomials.NEWTON_ITERATIONS,
+        "TIE_TOLERANCE": polynomials.TIE_ROUNDING_UNITS * sys.float_info.epsilon,
     }
     text = (native_library.C_FOLDER / "constants.h").read_text()
     found = {name: float(value) for name, value in re.findall(r"#define (\w+) (\S+)", text)}

@@ -10,17 +10,18 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from jaxbeam.model.channels import common_pairs, shaker_channels
 from jaxbeam.model.frequency_responses import (
     accelerance,
+    common_pairs,
     frequency_response,
     mobility,
     receptance,
     resonances_and_antiresonances,
+    shaker_channels,
 )
-from jaxbeam.model.linear_system import poles, zeros
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.state_space import poles, zeros
 from jaxbeam.model.static_correction import residual_actuator_gain
 from tests.differences import central
 from tests.loop_as_oracle import as_oracle

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.sections import corrected_deflection
 from jaxbeam.case.case import replace
 from jaxbeam.model.deflection_lines import (
     LoadInfluence,
@@ -18,7 +19,7 @@ from jaxbeam.model.deflection_lines import (
 )
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import sensor_rows, static_correction
+from jaxbeam.model.output_rows import sensor_rows, static_correction
 from jaxbeam.model.static_correction import (
     Motion,
     bending_moment,
@@ -27,7 +28,6 @@ from jaxbeam.model.static_correction import (
     residual_flexibility,
     shear_force,
 )
-from jaxbeam.simulation.derived_histories import corrected_deflection
 from tests.differences import central
 from tests.loop_as_oracle import as_oracle
 from tests.oracles import finite_elements

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import jaxbeam as jb
-from jaxbeam.case.quantities import TWIST
+from jaxbeam.case.sensors import TWIST
 from jaxbeam.model.statics import static_peak
 
 LENGTH, EI, MASS, GJ, INERTIA = 30.0, 2e10, 1e4, 4e9, 3e4

@@ -11,8 +11,7 @@ from numpy.polynomial.chebyshev import chebval
 from numpy.testing import assert_allclose
 
 from jaxbeam.numerics import matrices as module
-from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS, matvec, solve_unpivoted
-from jaxbeam.numerics.matrices import expm
+from jaxbeam.numerics.matrices import MAX_UNROLLED_TERMS, expm, matvec, solve_unpivoted
 from jaxbeam.numerics.normal_samples import normal_samples
 from jaxbeam.numerics.polynomials import piecewise_chebyshev, powers
 from tests.differences import central

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-import jaxbeam.numerics.peak_search
+import jaxbeam.numerics.polynomials
 from jaxbeam.integrator.propagators import PEAK_NODES
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
@@ -16,8 +16,8 @@ both_point_sets = pytest.mark.parametrize("points", [EQUAL, PEAK_NODES], ids=["e
 refine, estimate = (
     jax.jit(function, static_argnames="points")
     for function in (
-        jaxbeam.numerics.peak_search.refine_peak,
-        jaxbeam.numerics.peak_search.estimate_peak,
+        jaxbeam.numerics.polynomials.refine_peak,
+        jaxbeam.numerics.polynomials.estimate_peak,
     )
 )
 
@@ -125,10 +125,10 @@ def test_steps_of_no_length_hide_no_peak(short, peak):
     start = jnp.cumsum(lengths) - lengths
     times = start[:, None] + lengths[:, None] * np.array(PEAK_NODES)
     curves = 4.0 - (times - peak) ** 2
-    steps = jaxbeam.numerics.peak_search.steps_near_peak(
+    steps = jaxbeam.numerics.polynomials.steps_near_peak(
         curves[..., None], lengths, PEAK_NODES, jnp.abs
     )
-    positions, heights = jaxbeam.numerics.peak_search.locate_peak(curves[steps[:, 0]].T, PEAK_NODES)
+    positions, heights = jaxbeam.numerics.polynomials.locate_peak(curves[steps[:, 0]].T, PEAK_NODES)
     best = jnp.argmax(heights)
     assert float(heights[best]) == pytest.approx(4.0, rel=1e-13)
     found = start[steps[best, 0]] + (positions[best] + 1) / 2 * lengths[steps[best, 0]]

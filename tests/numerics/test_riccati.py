@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.numerics.batched_linalg import batch_axis_last
+from jaxbeam.control.lqr import LQR
+from jaxbeam.numerics.matrices import batch_axis_last
 from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
 from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
 from tests.differences import central

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BarycentricInterpolator
 
-from jaxbeam.numerics.batched_linalg import batch_axis_last
+from jaxbeam.numerics.matrices import batch_axis_last
 from jaxbeam.numerics.stages import (
     GAUSS_NODES,
     ConstantPlant,

@@ -30,8 +30,8 @@ from jaxbeam.plot import (
     plot_tuning,
     plot_vehicles,
 )
+from jaxbeam.plot.drawing import drawn_vehicle, vehicle_art
 from jaxbeam.plot.style import INK, format_number, separate_labels, unit_scale
-from jaxbeam.plot.traffic.drawing import drawn_vehicle, vehicle_art
 from tests.plot.figures import CASE, CASE as BALL, MANY, data, lines_of, words
 from tests.simulation.vehicles.test_vehicle_record import WAGON
 

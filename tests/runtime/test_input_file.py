@@ -15,11 +15,9 @@ import pytest
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.files.case_file import load_case_with
+from jaxbeam.files.case_file import load_case_with, profile_from_file
 from jaxbeam.files.export import read_gains
-from jaxbeam.files.matrices import write_state_space
-from jaxbeam.files.profile_file import profile_from_file
-from jaxbeam.files.tables import write_table
+from jaxbeam.files.tables import write_state_space, write_table
 from jaxbeam.runtime import input_file
 from jaxbeam.runtime.input_file import describe_content, read_input
 from jaxbeam.runtime.output_file import whole_file
@@ -249,11 +247,11 @@ BY_THEMSELVES = (
     "jaxbeam.c_code.translation",
     "jaxbeam.analysis.assessment.assessment",
     "jaxbeam.app.server",  # of the package
-    "jaxbeam.app.take_away",  # what it wrote into a temporary folder
-    "jaxbeam.case.loads.vehicles.vehicle",
+    "jaxbeam.app.questions",  # what it wrote into a temporary folder
+    "jaxbeam.case.loads.vehicles",
     "jaxbeam.cli.",
     "jaxbeam.files.export.files",
-    "jaxbeam.files.interactive",  # of the package
+    "jaxbeam.files.report",  # of the package
     "jaxbeam.files.netcdf",
     "jaxbeam.sweeps.store",  # after `check_codecs`
     "tuning.logs.readers.table",
@@ -412,7 +410,7 @@ def test_nothing_is_written_at_its_place():
     the browser writes into a temporary folder of its own.
     """
     by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.store"
-    by_themselves += "jaxbeam.app.studies", "jaxbeam.app.take_away"
+    by_themselves += "jaxbeam.app.studies", "jaxbeam.app.questions"
     writing = {"write_text", "write_bytes", "savefig", "savez", "to_netcdf", "to_zarr", "savemat"}
     wrong = []
     for module, path in module_files().items():

@@ -9,8 +9,8 @@ import numpy as np
 
 import jaxbeam as jb
 from jaxbeam import vehicles
-from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.load_identification import LoadIdentification
+from jaxbeam.control.state_controller import DesignModel
 from tests.c_code.cases import LATE, PERIOD
 from tests.model.test_layered_track import RIG
 from tests.strategies.examples import CONTROLLED, LOADS, PROFILES

@@ -9,7 +9,7 @@ import scipy
 
 import jaxbeam as jb
 from jaxbeam.case.case import crossing_times
-from jaxbeam.model.linear_system import poles
+from jaxbeam.model.state_space import poles
 
 BRIDGE = jb.Beam(25.0, 30e9, 15e3, damping_ratio=0.01, modes=5)
 # HSLM-A1 over a bridge with an absorber of 3750 kg at midspan, by its speed (km/h): smallest and

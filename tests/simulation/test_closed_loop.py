@@ -19,7 +19,7 @@ import jaxbeam as jb
 from jaxbeam.integrator.inputs import HeldCommands
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.sensor_signals import noise_samples
+from jaxbeam.model.sensor_signals import noise_samples
 from jaxbeam.model.state_space import state_space
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import (

@@ -15,9 +15,8 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.case.case import leaves_by_address
 from jaxbeam.case.fields import PACKAGES, import_modules
-from jaxbeam.case.loads.vehicles.vehicle import PlanarVehicle
-from jaxbeam.runtime.arrays import xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.case.loads.vehicles import PlanarVehicle
+from jaxbeam.runtime.arrays import Module, xp
 from tests.differences import central
 from tests.simulation.cases_of_numbers import CASES, JUMPING
 

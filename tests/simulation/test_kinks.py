@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.actuators.point import PointForce
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.vehicles.cars import Oscillator
+from jaxbeam.case.loads.vehicles import Oscillator
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.adaptive_reference import simulate_adaptive

@@ -10,14 +10,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.sections import corrected_deflection
 from jaxbeam.case.beam import rigidity
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.vehicles.cars import Oscillator
+from jaxbeam.case.loads.vehicles import Oscillator
 from jaxbeam.integrator import native_peaks
 from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history
-from jaxbeam.simulation.derived_histories import corrected_deflection
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central
 from tests.modules import ROOT

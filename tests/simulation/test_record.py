@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.fields import PACKAGES, import_modules
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.simulation.test_every_number import subclasses
 

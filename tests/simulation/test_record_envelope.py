@@ -12,7 +12,7 @@ from jaxbeam.analysis.sections import influence_table
 from jaxbeam.case.case import replace
 from jaxbeam.library.published import trains
 from jaxbeam.plot import plot_envelope
-from jaxbeam.simulation import record_envelope as module
+from jaxbeam.simulation import record as module
 from jaxbeam.simulation.integration_plan import integration_plan
 
 BEAM = jb.Beam(length=30.0, flexural_rigidity=3e10, mass_per_length=1e4, damping_ratio=0.1)

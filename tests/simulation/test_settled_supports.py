@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.vehicles.cars import Oscillator
+from jaxbeam.case.loads.vehicles import Oscillator
 from jaxbeam.case.profiles.shapes import RampProfile
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.settlement import surface
+from jaxbeam.model.transfer_matrices import surface
 from tests.differences import central
 from tests.oracles import finite_elements as fe
 

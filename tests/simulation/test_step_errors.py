@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.integration_plan import AMPLIFICATION

@@ -8,11 +8,11 @@ import pytest
 import scipy
 
 import jaxbeam as jb
-from jaxbeam.analysis.assessment.high_speed import train_response
-from jaxbeam.analysis.assessment.static_checks import (
+from jaxbeam.analysis.assessment.checks import (
     CheckedSection,
     largest_under_train,
     tabulated_line,
+    train_response,
 )
 from jaxbeam.case.track import SLEEPER_FRACTIONS
 from jaxbeam.library import published

@@ -14,10 +14,8 @@ from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.filters import Filter
 from jaxbeam.case.loads.point import MovingForce, MovingMass
-from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.sensors import QUANTITIES, Filter, Sensor
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:

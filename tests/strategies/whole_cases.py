@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicle_parts import VehicleSensor
 from jaxbeam.case.validation import check_case
 from tests.strategies import actuators, sensors
 from tests.strategies.examples import CONTROLLED, LOADS, PROFILES

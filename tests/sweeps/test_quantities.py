@@ -14,7 +14,7 @@ from jaxbeam.integrator.static_shapes import longest_stable_step
 from jaxbeam.integrator.step_size import trial_run, without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.simulation.errors import MAX_SAMPLES
 from jaxbeam.sweeps.quality import SAMPLES, TruncationWarning
 from tests.modules import ROOT

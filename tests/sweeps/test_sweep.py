@@ -18,7 +18,7 @@ from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.case import declared_checks
+from jaxbeam.case import fields
 from jaxbeam.case.case import replace
 from jaxbeam.integrator.force_peaks import peaks_of_forces
 from jaxbeam.integrator.peaks import Peaks
@@ -159,7 +159,7 @@ def test_histories_on_request():
 @IMPLAUSIBLE
 def test_failed_run_is_marked_and_changes_no_other(monkeypatch):
     """An infinite weight, which is refused otherwise, makes one run fail."""
-    monkeypatch.setattr(declared_checks, "LARGEST", np.inf)
+    monkeypatch.setattr(fields, "LARGEST", np.inf)
     masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
     with pytest.warns(FailedRunsWarning, match="1 of 4 runs failed, the first at loads"):
         dataset = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
@@ -177,7 +177,7 @@ def test_runs_that_all_fail_are_told(by_forces, monkeypatch, tmp_path):
 
     Infinite weights, which are refused otherwise; motions that are not finite.
     """
-    monkeypatch.setattr(declared_checks, "LARGEST", np.inf)
+    monkeypatch.setattr(fields, "LARGEST", np.inf)
 
     def no_peaks(*given):
         return Peaks(*(np.full_like(part, np.nan) for part in peaks_of_forces(*given)))

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.case import own_addresses
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
+from jaxbeam.case.loads.vehicles import VehicleLoad
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.load_set import load_set
 from jaxbeam.sweeps import integration

@@ -15,9 +15,8 @@ from tests.oracles import crossing, finite_elements
 from tests.oracles.crossing import Load
 from tuning import Fit, Log
 from tuning.fit.dataset import make_dataset
-from tuning.fit.least_squares import LeastSquares
+from tuning.fit.least_squares import LeastSquares, t_quantile
 from tuning.fit.result import fit_result
-from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.parameters.free import free_parameters, to_unbounded
 
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample

@@ -13,9 +13,8 @@ from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
 from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
-from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
-from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.case.reading.units import in_si, is_quantity
+from jaxbeam.case.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
+from jaxbeam.case.toml_file import in_si, is_quantity, read_toml
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.files.case_file import with_settings
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.lqr import LQR
 from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import ALL_METRICS, Objective

@@ -29,7 +29,7 @@ from jaxbeam.simulation.simulate import Histories, simulate, simulate_histories
 from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_cases
 from tuning.control.objective import Sharpness, run_metrics, with_fixed_design
 from tuning.fit.result import Fit
-from tuning.fit.uncertainty.posterior import Posterior
+from tuning.fit.uncertainty import Posterior
 
 MAX_DRAWS_PER_PLANT = 100  # draws from which each plant within the bounds is selected
 

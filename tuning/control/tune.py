@@ -26,7 +26,7 @@ from tuning.control.penalised_objective import STABILITY_PENALTY_SLOPE, Stabilit
 from tuning.control.run_set import RunSet, draw_plants, make_run_set, with_identified_plant
 from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
 from tuning.fit.result import Fit
-from tuning.fit.uncertainty.posterior import Posterior
+from tuning.fit.uncertainty import Posterior
 from tuning.parameters.free import free_parameters
 
 ParameterBounds = Mapping[str, tuple[float, float] | None]

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.compare import Comparison, compare
-from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.feedforward import hand_drawn_law
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate

@@ -4,8 +4,7 @@ from tuning.fit.frequency_responses import Responses, responses_of
 from tuning.fit.modal_parameters import ModalParameterFit
 from tuning.fit.model_validation import compare_fits, cross_validate, predict_held_out
 from tuning.fit.report import write_report
-from tuning.fit.uncertainty.posterior import sample
-from tuning.fit.uncertainty.profile import profile
+from tuning.fit.uncertainty import profile, sample
 
 __all__ = [
     "ModalParameterFit",

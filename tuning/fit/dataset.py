@@ -14,7 +14,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.time_grid import EventSchedule, stack_schedules
 from jaxbeam.model.layout import largest_layout
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
-from tuning.fit.uncertainty.covariance import autocorrelation, autocorrelation_factor
+from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
 from tuning.parameters.free import with_values

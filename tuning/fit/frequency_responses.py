@@ -19,9 +19,8 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import OUTSIDE, refuse_traced, refuses_traced
 from jaxbeam.model.frequency_responses import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
-from tuning.fit.least_squares import MAX_STEPS, LeastSquares
-from tuning.fit.summary import parameter_table
-from tuning.fit.uncertainty.covariance import confidence_intervals
+from tuning.fit.least_squares import MAX_STEPS, LeastSquares, confidence_intervals
+from tuning.fit.result import parameter_table
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter, Prior, free_parameters
 from tuning.parameters.prediction import FunctionPrediction

@@ -20,9 +20,8 @@ from scipy.stats import norm
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.modes import mesh_layout, modes
-from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
-from tuning.fit.summary import parameter_table
-from tuning.fit.uncertainty.covariance import t_quantile, uncertainty
+from tuning.fit.least_squares import WEAK_PRIOR_WIDTH, t_quantile, uncertainty
+from tuning.fit.result import parameter_table
 from tuning.modal.result import ModalEstimates, mac_matrix
 from tuning.parameters.free import FreeParameter, Prior, free_parameters, to_unbounded
 

@@ -9,10 +9,8 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files import report
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
 from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria
-from tuning.fit.result import Fit
-from tuning.fit.summary import interval_text
-from tuning.fit.uncertainty.posterior import Posterior
-from tuning.fit.uncertainty.profile import Profile
+from tuning.fit.result import Fit, interval_text
+from tuning.fit.uncertainty import Posterior, Profile
 
 
 @refuses_traced("a report")
@@ -52,7 +50,7 @@ def report_sections(
     models: Sequence[ModelCriteria] = (),
 ) -> list[ReportSection]:
     """Sections of the report on a fit; arguments left out have no section."""
-    from tuning.fit.uncertainty.profile import plot_posterior, plot_profiles
+    from tuning.fit.uncertainty import plot_posterior, plot_profiles
 
     tables = [_parameter_table(fit), *_minima_table(fit)]
     measured = [ReportFigure("fit", fit.plot()), _residual_table(fit)]

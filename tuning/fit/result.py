@@ -1,4 +1,4 @@
-"""Result of an identification: values with standard errors, residuals, and remarks on both.
+"""Result of an identification: values with standard errors, residuals, remarks, and its text.
 
 Fits on disk: the parameters found, with the case and the logs, in one file.
 """
@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,10 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
-from jaxbeam.case.quantities import unit_of
+from jaxbeam.case.sensors import unit_of
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.runtime.printer import TableViews
+from jaxbeam.runtime.printer import Row, TableViews, text_table
 from tuning.checkpoint import read_arrays, save
-from tuning.fit import summary
 from tuning.fit.dataset import (
     ChannelResiduals,
     Dataset,
@@ -28,10 +28,148 @@ from tuning.fit.dataset import (
     make_dataset,
     residual_remarks,
 )
-from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution, LocalMinimum
-from tuning.fit.uncertainty.covariance import confidence_intervals
+from tuning.fit.least_squares import (
+    MAX_STEPS,
+    LeastSquares,
+    LeastSquaresSolution,
+    LocalMinimum,
+    confidence_intervals,
+)
 from tuning.logs.log import Log
+from tuning.logs.quality import find_faults, samples_held
 from tuning.parameters.free import LOG_ADDRESS, FreeParameter, Prior, to_unbounded, with_values
+
+MAX_CORRELATION = 0.95  # correlation beyond which two parameters are called hard to tell apart
+PRIOR_DOMINANCE = 0.7  # of the prior's deviation: with a larger error the logs say less than it
+
+NOT_IDENTIFIABLE = "not identifiable"
+Parameters = Sequence[FreeParameter]
+Values = Float[np.ndarray, " parameter"]
+
+
+def interval_text(interval: Float[np.ndarray, "2"]) -> str:
+    """A 95 % interval in words; infinite ones are those of parameters not identifiable."""
+    if not np.all(np.isfinite(interval)):
+        return NOT_IDENTIFIABLE
+    return f"{interval[0]:.5g} to {interval[1]:.5g}"
+
+
+def parameter_table(
+    parameters: Parameters, values: Values, intervals: Float[np.ndarray, "parameter 2"]
+) -> list[str]:
+    """Lines of a table: address, unit, start, fitted value and 95 % interval."""
+    rows: list[Row] = [
+        (
+            parameter.address,
+            "" if parameter.unit == "1" else parameter.unit,
+            f"{parameter.start:.5g}",
+            f"{value:.5g}",
+            interval_text(interval),
+        )
+        for parameter, value, interval in zip(parameters, values, intervals, strict=True)
+    ]
+    header = ("parameter", "unit", "start", "fitted", "95 % interval")
+    return text_table(header, rows, "<<>><")
+
+
+def minima_lines(minima: Sequence[LocalMinimum]) -> list[str]:
+    """The minima that several starts led to, lowest first; no lines for a single start."""
+    if not minima:
+        return []
+    lines = ["", f"{len(minima)} minima from {sum(m.starts for m in minima)} starts:"]
+    for found in minima:
+        values = "  ".join(f"{value:.5g}" for value in found.values)
+        state = "" if found.converged else "  (not converged)"
+        lines.append(f"  misfit {found.cost:.6g} from {found.starts} starts: {values}{state}")
+    return lines
+
+
+def bound_remarks(parameters: Parameters, values: Values) -> Iterator[str]:
+    """Sentences on parameters that ended at a bound."""
+    for parameter, value in zip(parameters, values, strict=True):
+        if parameter.at_bound(value):
+            yield (
+                f"{parameter.address} ended at its bound ({parameter.low:.5g} to "
+                f"{parameter.high:.5g}): the logs fit best there or beyond, and the intervals do "
+                "not hold; widen the bounds if they may be wrong"
+            )
+
+
+def unidentifiable_remarks(
+    parameters: Parameters, unidentifiable: Sequence[dict[str, float]]
+) -> Iterator[str]:
+    """Sentences on unidentifiable directions, each a dictionary from address to change (SI)."""
+    units = {parameter.address: parameter.unit for parameter in parameters}
+    for direction in unidentifiable:
+        if len(direction) == 1:
+            yield (
+                f"{next(iter(direction))} is not identifiable from the data: give it a value known "
+                "otherwise"
+            )
+            continue
+        changes = [f"{a} by {change:+.3g} {units[a]}" for a, change in direction.items()]
+        yield (
+            f"a change of {', '.join(changes)} together is not identifiable from the data: give "
+            "one of them a value known otherwise"
+        )
+
+
+def correlation_remarks(
+    addresses: Sequence[str], correlation: Float[np.ndarray, "parameter parameter"]
+) -> Iterator[str]:
+    """Sentences on pairs of parameters that are strongly correlated."""
+    for i, j in np.argwhere(np.triu(np.abs(np.nan_to_num(correlation)) > MAX_CORRELATION, 1)):
+        yield (
+            f"{addresses[i]} and {addresses[j]} are hard to tell apart: "
+            f"correlation {correlation[i, j]:.3f}"
+        )
+
+
+def prior_remarks(parameters: Parameters, errors: Values) -> Iterator[str]:
+    """Sentences on parameters whose standard error is nearly that of their prior."""
+    for parameter, error in zip(parameters, errors, strict=True):
+        deviation = parameter.prior.deviation
+        if deviation is not None and error > PRIOR_DOMINANCE * deviation:
+            yield f"{parameter.address} is determined by its prior more than by the logs"
+
+
+def channel_names(case: Case) -> list[str]:
+    """Names of all sensors of a case: "sensor 0", then "vehicle sensor 0" for those on vehicles."""
+    on_vehicles = [f"vehicle sensor {i}" for i in range(len(case.vehicle_sensors))]
+    return [f"sensor {i}" for i in range(len(case.sensors))] + on_vehicles
+
+
+def noise_remarks(
+    case: Case, logs: Sequence[Log], noise: Float[np.ndarray, "log channel"]
+) -> Iterator[str]:
+    """A sentence for each log: standard deviations of its residuals, with their units."""
+    named = list(zip((s.unit for s in case.all_sensors), channel_names(case), strict=True))
+    for log, levels in zip(logs, noise, strict=True):
+        pairs = zip(levels, named, strict=True)
+        words = [f"{n:.3g} {unit} ({name})" for n, (unit, name) in pairs if np.isfinite(n)]
+        yield f"standard deviation of the residual of {log.source}: {', '.join(words)}"
+
+
+def held_reading_remarks(case: Case, logs: Sequence[Log]) -> Iterator[str]:
+    """Logs with readings between the samples of the case's controller, which holds its own."""
+    period = None if case.controller is None else case.controller.period
+    if period is None or all(sensor.sampling_period is not None for sensor in case.sensors):
+        return
+    for log in logs:
+        step = float(np.median(np.diff(log.times)))
+        if step < 0.9 * float(period) and any(samples_held(one) == 1 for one in log.values.T):
+            yield (
+                f"{log.source}: its readings come every {step:.4g} s, but a controller holds those"
+                f" of sensors without a sampling_period for its period, {float(period):.4g} s: set"
+                f" sensors.N.sampling_period to {step:.4g} s if the log is not the controller's"
+            )
+
+
+def log_remarks(logs: Sequence[Log]) -> Iterator[str]:
+    """Notes made when logs were read, and faults that were found and not masked."""
+    for log in logs:
+        yield from (f"{log.source}: {note}" for note in log.notes)
+        yield from (f"{fault} (not masked)" for fault in find_faults(log))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,26 +288,26 @@ class Fit(TableViews):
     @property
     def remarks(self) -> list[str]:
         """Sentences on bounds, unidentifiable directions, correlations, priors, noise and logs."""
-        logs, channel_names = self.dataset.logs, summary.channel_names(self.case)
+        logs, names = self.dataset.logs, channel_names(self.case)
         return [
-            *summary.bound_remarks(self.parameters, self.values),
-            *summary.unidentifiable_remarks(self.parameters, self.unidentifiable),
-            *summary.correlation_remarks(self.addresses, self.correlation),
-            *summary.prior_remarks(self.parameters, self.errors),
-            *summary.noise_remarks(self.case, logs, self.noise),
+            *bound_remarks(self.parameters, self.values),
+            *unidentifiable_remarks(self.parameters, self.unidentifiable),
+            *correlation_remarks(self.addresses, self.correlation),
+            *prior_remarks(self.parameters, self.errors),
+            *noise_remarks(self.case, logs, self.noise),
             *residual_remarks(
                 self.channel_residuals,
                 [log.source for log in logs],
-                channel_names,
+                names,
                 [any(one is not None for one in log.actuators) for log in logs],
             ),
-            *summary.held_reading_remarks(self.case, logs),
-            *summary.log_remarks(logs),
+            *held_reading_remarks(self.case, logs),
+            *log_remarks(logs),
         ]
 
     def __str__(self) -> str:
-        table = summary.parameter_table(self.parameters, self.values, self.intervals)
-        minima = summary.minima_lines(self.minima)
+        table = parameter_table(self.parameters, self.values, self.intervals)
+        minima = minima_lines(self.minima)
         return "\n".join([self.verdict, "", *table, *minima, "", *self.remarks])
 
     def to_dict(self) -> dict:
@@ -200,7 +338,7 @@ class Fit(TableViews):
         from jaxbeam.plot import FitPanel, plot_fit
 
         quantities = [sensor.quantity for sensor in self.case.all_sensors]
-        channel_names = summary.channel_names(self.case)
+        names = channel_names(self.case)
         panels = []
         for i, log in enumerate(self.dataset.logs):
             count = log.times.size
@@ -215,7 +353,7 @@ class Fit(TableViews):
                         times=log.times,
                         measured=self.dataset.measured[i, :count, channels].T,
                         fitted=self.fitted[i, :count, channels].T,
-                        names=[channel_names[n] for n in channels],
+                        names=[names[n] for n in channels],
                         unit=str(unit_of(quantity)),
                         valid=self.dataset.mask[i, :count, channels].T > 0,
                     )

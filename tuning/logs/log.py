@@ -45,7 +45,7 @@ class Log:
     """Samples of some channels over time, in SI units.
 
     `times` in s increase strictly; `values` are in the SI unit of each channel's quantity; both are
-    read-only. `quantities` are those of sensors (`jaxbeam.case.quantities`), "force" (N) or
+    read-only. `quantities` are those of sensors (`jaxbeam.case.sensors`), "force" (N) or
     "voltage" (V); `units` are those of the file, for labels. `sensors` and `positions` (m) are the
     index and position of the sensor of the case that a channel is, None if unknown; `actuators` the
     index of the actuator whose command it is, None for readings; `vehicle_sensors` the index of the

@@ -9,11 +9,11 @@ from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete, kind_of
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.quantities import unit_of
+from jaxbeam.case.sensors import unit_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.feedforward import Prescribed
 from tuning.logs.log import Log
-from tuning.logs.logger import samples_held
+from tuning.logs.quality import samples_held
 
 MAX_START_DURATIONS = 10.0  # first time of a log, in its durations, that is simulated from 0 on
 COMMAND_UNITS = {"voltage": "V", "force": "N"}

@@ -8,7 +8,7 @@ import math
 import re
 from typing import NamedTuple
 
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 
 
 class Unit(NamedTuple):

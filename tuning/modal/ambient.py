@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy import linalg
 from scipy.stats import norm, t as student
 
-from tuning.modal.likelihood.refine import Start, refine_modes
+from tuning.modal.likelihood import Start, refine_modes
 from tuning.modal.preprocessing import Prepared, check_length, prepare
 from tuning.modal.result import (
     MIN_ENERGY,

@@ -128,7 +128,7 @@ class ModalFit(ModalEstimates):
         Raises ValueError for another ending than .html and a fit without a diagram,
         FileExistsError if the file exists, without `overwrite`.
         """
-        from tuning.modal.diagram_page import diagram_page
+        from tuning.modal.plot import diagram_page
 
         check_ending(path, "an interactive figure", (".html",))
         page = diagram_page(self)

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxbeam.case.fields import refuses_traced
 from tuning.logs.log import Log
-from tuning.logs.logger import sensor_readings
+from tuning.logs.quality import sensor_readings
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.arguments import (

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float
 
-from tuning.monitoring.tracks import ModeTrack
+from tuning.monitoring.history import ModeTrack
 
 WEIGHT = 0.2  # of the newest log in the moving average, usual for changes of about one deviation
 MIN_FREE = 10  # logs more than coefficients, which a regression needs

@@ -40,7 +40,7 @@ import scipy.linalg
 import scipy.optimize
 from jaxtyping import Bool, Float
 
-from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.fit.least_squares import t_quantile
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
 # Hz, of bodies on air or leaf springs, which bounce and pitch, and of axles of lorries (OECD 1998).

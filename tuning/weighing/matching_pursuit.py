@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.point import MovingMass
-from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.fit.least_squares import t_quantile
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import dynamic_errors, dynamic_waves, white_noise

@@ -25,10 +25,9 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.runtime.progress import ProgressBar
-from tuning.logs.description import version_of
 from tuning.logs.log import Log, LogWarning
 from tuning.logs.pairing import sensor_readings
-from tuning.logs.reading import read_log
+from tuning.logs.reading import read_log, version_of
 from tuning.modal.preprocessing import with_channels
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.detectors import LEAST_GAP, axles_of_pulses, pulse_times

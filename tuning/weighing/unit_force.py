@@ -3,7 +3,7 @@
     z' = A z - B psi(x(t)),    y = C z - D psi(x(t)) - G(x(t)),
 
 with the modes psi at the force, the state space of the modal model, and the static correction G of
-curvature, strain and section forces (see `jaxbeam.model.sensing.output_rows`). Velocities and
+curvature, strain and section forces (see `jaxbeam.model.output_rows`). Velocities and
 accelerations follow from these states, which are exact for a psi that is linear between fine steps;
 other readings are static, with z' = 0: a heavy load changes the frequencies of the beam.
 """
@@ -20,8 +20,8 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import sensor_rows, static_correction
-from jaxbeam.model.sensing.sensor_signals import needs_times, sampled_readings
+from jaxbeam.model.output_rows import sensor_rows, static_correction
+from jaxbeam.model.sensor_signals import needs_times, sampled_readings
 
 STEPS_PER_CROSSING = 200
 STEPS_PER_PERIOD = 12  # of the highest mode

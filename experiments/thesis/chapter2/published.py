@@ -1,6 +1,6 @@
 """Chapter 2: modes, critical speeds, moving force and mass, shaker, patches."""
 
-from experiments.thesis.published_numbers import DIGITS, FORMULA, HZ, PublishedNumbers
+from experiments.thesis.verdicts import DIGITS, FORMULA, HZ, PublishedNumbers
 
 RIG_A, RIG_B, RIG_D = "rig A, chapter 2", "rig B, chapter 2", "rig D, chapter 2"
 RIG_A_CONTROLLED = "rig A, chapter 5"

@@ -13,11 +13,11 @@ from experiments.thesis.cases import data_physics_v4
 from experiments.thesis.chapter2 import published
 from experiments.thesis.chapter2.patches import DENSITY, MODULUS
 from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, make_finding
-from jaxbeam.model.channels import shaker_channels
 from jaxbeam.model.frequency_responses import (
     FrequencyResponse,
     frequency_response,
     resonances_and_antiresonances,
+    shaker_channels,
 )
 from jaxbeam.plot.style import colour, set_title, use_style
 

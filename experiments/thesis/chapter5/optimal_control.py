@@ -37,7 +37,7 @@ from experiments.thesis.chapter5.regulators import (
     interpreted_rigs,
     time_varying_loops,
 )
-from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.report import plot_commands, plot_deflections
 from experiments.thesis.verdicts import (
     LITERAL,
     Experiment,

@@ -1,6 +1,6 @@
 """Chapter 5: optimal control of one span with a shaker."""
 
-from experiments.thesis.published_numbers import (
+from experiments.thesis.verdicts import (
     DIGITS,
     SAME_CURVE,
     YES_OR_NO,

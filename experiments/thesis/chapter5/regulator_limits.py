@@ -16,7 +16,7 @@ from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.stability import Growth, frozen_poles, growth, stability_limit
-from jaxbeam.control.optimal.sampled_lqr import sampling_limit
+from jaxbeam.control.sampled_lqr import sampling_limit
 from jaxbeam.numerics.riccati import dlqr
 from jaxbeam.plot.modes import plot_poles
 

@@ -18,7 +18,7 @@ from experiments.thesis.chapter5.regulator_limits import (
 )
 from experiments.thesis.verdicts import LITERAL
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.integration_plan import IntegrationPlan
 

@@ -13,28 +13,27 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.thesis.cases import reduction, with_duration
-from experiments.thesis.chapter6 import published
-from experiments.thesis.chapter6.filter_oscillation import (
-    fitted_correction,
-    oscillation_findings,
-)
-from experiments.thesis.chapter6.gain_scheduling import (
-    HIGHER_GAINS,
-    derived_schedules,
-    schedule_findings,
-    switching_masses,
-)
-from experiments.thesis.chapter6.patch_rigs import (
+from experiments.thesis.cases import (
     GAIN,
     MASSES,
     ONE_SPAN_CUTOFF,
     TWO_SPAN_CUTOFF,
+    reduction,
     simulate_changes,
     static_extremes,
+    with_duration,
     with_feedback,
 )
-from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.chapter6 import published
+from experiments.thesis.chapter6.gain_scheduling import (
+    HIGHER_GAINS,
+    derived_schedules,
+    fitted_correction,
+    oscillation_findings,
+    schedule_findings,
+    switching_masses,
+)
+from experiments.thesis.report import plot_commands, plot_deflections
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.simulation.simulate import ContactLossWarning

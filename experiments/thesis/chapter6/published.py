@@ -1,6 +1,6 @@
 """Chapter 6: displacement feedback of one and two spans with patches."""
 
-from experiments.thesis.published_numbers import (
+from experiments.thesis.verdicts import (
     DIGITS,
     FORMULA,
     HZ,

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.cases import reduction, with_duration, with_modes
 from experiments.thesis.chapter7 import published
-from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.report import plot_commands, plot_deflections
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
-from jaxbeam.analysis.bound.input_influence import input_influence
-from jaxbeam.analysis.bound.linear_program import least_peak
-from jaxbeam.control.design_model import DesignModel
+from jaxbeam.analysis.bound.bound import input_influence, least_peak
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.plot.style import GREY, set_title, use_style
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes

@@ -1,6 +1,6 @@
 """Chapter 7: model predictive control of one and two spans with patches."""
 
-from experiments.thesis.published_numbers import (
+from experiments.thesis.verdicts import (
     DIGITS,
     SAMPLE_INSTANT,
     YES_OR_NO,

@@ -6,24 +6,24 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbeam.analysis.assessment.assessment import REQUIRED, Assessment, code_numbers
-from jaxbeam.analysis.assessment.static_checks import (
+from jaxbeam.analysis.assessment.checks import (
+    TrackState,
     analysis_check,
     damping_checks,
     factor_checks,
     frequency_check,
+    train_checks,
 )
-from jaxbeam.analysis.assessment.train_checks import TrackState, train_checks
 from jaxbeam.analysis.sections import spans
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced
-from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced, suggestion
+from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.track import THREE_SLEEPERS, Track, track_of
 from jaxbeam.case.validation import check_case
 from jaxbeam.library.published import trains as library
 from jaxbeam.model.modes import modes
+from jaxbeam.model.output_rows import counted_frequency
 from jaxbeam.model.plausibility.check import warn_if_implausible
-from jaxbeam.model.sensing.output_rows import counted_frequency
 
 CODES = ("en1991-2",)
 DECKS = ("ballasted", "slab")

@@ -1,48 +1,393 @@
 """Lower bound on the peak deflection: the least peak over all commands within the limits.
 
-For given loads and a given profile the deflection is affine in the held commands u_k
-(`input_influence`), and its least peak p is the optimum of a linear program,
+For given loads and a given profile the deflection is affine in the held commands u_k: the beam
+under moving loads varies in time, but it is linear in its commands. With u_k the command to one
+actuator during one hold,
+
+    w(x, t) = w_0(x, t) + sum_k g_k(x, t) u_k.
+
+Both parts come from the integrator of `simulate`, in batches of unit commands on one load path. The
+least peak p is the optimum of a linear program,
 
     minimise p   subject to   |w_0(x, t) + sum_k g_k(x, t) u_k| <= p,
                               u_min <= u_k <= u_max,   |u_k - u_(k-1)| <= rate * period,
 
 at all positions x and times t. No controller that holds its commands over the same period has a
 smaller peak, whatever it measures, estimates or predicts.
+
+The unknowns are the commands, bounds on their changes and absolute values, and the peak. Rows that
+keep the deflection below the peak are generated: those violated are added until none is, so that
+many positions cost little. Many commands attain the least peak; a small penalty on changes and
+absolute values selects smooth ones, and reduces the number of rounds.
 """
 
 import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float
+import scipy  # loads its parts on first use; all of them take a third of a second
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.bound.input_influence import (
-    TOLERANCE,
-    InputInfluence,
-    input_influence,
-)
-from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
-from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import refuses_traced
+from jaxbeam.case.fields import check_on_beam, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.integrator.inputs import AbstractInputPolicy
+from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
 from jaxbeam.integrator.peaks import RunningPeaks
+from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import choose_step_size
-from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.channels import accepts_commands
+from jaxbeam.integrator.time_grid import (
+    EventSchedule,
+    Transmission,
+    controller_schedule,
+    grid_by_schedule,
+    grid_by_step_length,
+)
+from jaxbeam.model.frequency_responses import accepts_commands
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, Module, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.memory import block_memory, free_memory, size_text
 from jaxbeam.simulation.commands import acting_ranges
+from jaxbeam.simulation.integration_plan import steps_per_interval
 from jaxbeam.simulation.record import Record
+
+TOLERANCE = 1e-9  # relative to the largest deflection
+MAX_BATCH_SIZE = 1024  # unit commands at once; fewer where memory is short
+COPIES = 3  # of the states of all steps of a run, while they are integrated
+
+
+class InputInfluence(Module):
+    """Modal coordinates at `times` (s): `unforced` by commands, and `response` to unit commands.
+
+    A unit command is held from one of the `hold_times` (s) to the next. `deflection_rows` map the
+    coordinates to the deflection (m) at given positions. Relative errors are about 1e-9.
+    """
+
+    deflection_rows: Float[np.ndarray, "position mode"]
+    hold_times: Float[np.ndarray, " hold"]
+    times: Float[np.ndarray, " time"]
+    unforced: Float[np.ndarray, "time mode"]
+    response: Float[np.ndarray, "time mode hold actuator"]
+
+    def deflection(
+        self, commands: Float[np.ndarray, "hold actuator"]
+    ) -> Float[np.ndarray, "time position"]:
+        """Deflection (m) under held commands."""
+        return (
+            self.unforced + np.tensordot(self.response, commands, axes=2)
+        ) @ self.deflection_rows.T
+
+
+class _UnitCommands(AbstractInputPolicy):
+    """Input policy of unit commands: in each run to one actuator, during one hold."""
+
+    schedule: EventSchedule
+    hold_index: Int[Array, " batch"]
+    actuator_index: Int[Array, " batch"]
+    load_amplitude: float
+    actuators: int = eqx.field(static=True)
+    implicit: bool = eqx.field(static=True, default=False)
+
+    def start(self, batch_size):
+        return xp.zeros((), int)
+
+    def inputs(self, memory, state, step_info, states):
+        hold_started = take(self.schedule.control_sample, step_info.event)
+        current_hold = xp.where((step_info.event >= 0) & (hold_started >= 0), hold_started, memory)
+        is_commanded = self.actuator_index == np.arange(self.actuators)[:, None]
+        command = xp.where(is_commanded & (self.hold_index == current_hold), 1.0, 0.0)
+        return xp.broadcast_to(command, (NODE_COUNT, *command.shape)), current_hold
+
+    def observe(self, memory, step_info):
+        return None
+
+
+def input_influence(
+    case: Case, positions: Float[np.ndarray, " position"], period: float, spacing: float
+) -> InputInfluence:
+    """Influence of commands held over a period (s) on a case, with rows for positions (m).
+
+    The controller of the case, if any, is left out. Times are at most `spacing` (s) apart; the
+    starts of all holds and the end of the run are among them.
+
+    Raises ValueError if the response takes more than half of the memory that is free, RuntimeError
+    if no time step meets TOLERANCE.
+    """
+    duration = float(case.run.duration)
+    count = max(1, int(np.ceil(duration / period * (1 - 1e-12))))
+    steps_per_hold = max(1, int(np.ceil(period / spacing * (1 - 1e-9))))
+    hold_times = np.arange(count) * period
+    times = np.append(np.arange(count * steps_per_hold) * (period / steps_per_hold), duration)
+    times = times[(times < duration * (1 - 1e-9)) | (times == duration)]
+    actuators = len(case.actuators)
+    size, memory = 8.0 * times.size * case.beam.modes * count * actuators, free_memory()
+    if size > memory / 2:
+        raise ValueError(
+            f"responses to {count} holds at {times.size} times take {size_text(size)}, more than"
+            f" half of the {size_text(memory)} of memory that are free; hold commands for longer"
+            f" than {period:g} s, or lower run.sample_rate"
+        )
+    uncontrolled_case = dataclasses.replace(case, controller=None)
+    shapes = static_shapes(uncontrolled_case)
+    step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    schedule = controller_schedule(times, Transmission(hold_times, hold_times), [], np.zeros(0))
+    substeps = steps_per_interval(np.diff(times).max(), step)
+    # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; of
+    # these the padding is disturbed by the profile alone, as all runs with a command are.
+    hold_index = np.append([-1, count], np.repeat(np.arange(count), actuators))
+    actuator_index = np.append([0, 0], np.tile(np.arange(actuators), count))
+    run_bytes = 8.0 * COPIES * times.size * substeps * 2 * case.beam.modes
+    allowed = max(1, int(block_memory() / run_bytes))
+    batch_size = min(MAX_BATCH_SIZE, hold_index.size, allowed)
+    padding = -hold_index.size % batch_size
+    hold_index, actuator_index = (
+        np.append(hold_index, np.full(padding, count)),
+        np.append(actuator_index, np.zeros(padding, int)),
+    )
+    coordinates = np.concatenate(
+        [
+            _unit_responses(uncontrolled_case, shapes, schedule, substeps, *indices)
+            for indices in zip(
+                hold_index.reshape(-1, batch_size),
+                actuator_index.reshape(-1, batch_size),
+                strict=True,
+            )
+        ],
+        axis=-1,
+    )
+    response = coordinates[..., 2 : count * actuators + 2]
+    if load_set(case).profile is not None:
+        response = response - coordinates[..., 1:2]
+    return InputInfluence(
+        _deflection_rows(uncontrolled_case, shapes, positions),
+        hold_times,
+        times,
+        coordinates[..., 0],
+        response.reshape(*response.shape[:2], count, actuators),
+    )
+
+
+@compiled_if_traced
+def _deflection_rows(case: Case, shapes: StaticShapes, positions):
+    return modal_model(case, shapes.layout).shapes(positions, (0,))[0]
+
+
+@compiled_if_traced
+def _unit_responses(
+    case: Case,
+    shapes: StaticShapes,
+    schedule: EventSchedule,
+    substeps: int,
+    hold_index,
+    actuator_index,
+):
+    """Modal coordinates (time, mode, batch): under weights for hold -1, else a unit command."""
+    model, case_loads = modal_model(case, shapes.layout), load_set(case, shapes.layout)
+    size = (case_loads.wheel_count, hold_index.shape[0])
+    wheels = jax.tree.map(
+        lambda part: xp.broadcast_to(part, (*part.shape[:-1], size[1])), case_loads.wheels
+    )
+    is_loaded = hold_index == -1
+    histories = {
+        wheel: dataclasses.replace(
+            history,
+            amplitudes=xp.where(is_loaded, history.amplitudes, 0.0),
+            forces=xp.where(is_loaded, history.forces, 0.0),
+        )
+        for wheel, history in wheels.histories.items()
+    }
+    weight = xp.where(is_loaded, wheels.weight, 0.0)
+    wheels = dataclasses.replace(wheels, weight=weight, histories=histories)
+    loads = dataclasses.replace(case_loads, wheels=wheels)
+    policy = _UnitCommands(
+        schedule=schedule,
+        hold_index=hold_index,
+        actuator_index=actuator_index,
+        load_amplitude=np.inf,
+        actuators=len(case.actuators),
+    )
+    grid = grid_by_schedule(case, model, schedule, substeps)
+    steps = grid.counts.shape[0] * substeps
+    discrete = discrete_model(model, grid, None, policy)
+    _, states, *_ = integrate_history(
+        discrete, loads, max_loads=shapes.max_loads, steps=steps, policy=policy
+    )
+    sample_steps = substeps * grid.event_panels[schedule.sample_events]
+    return states[sample_steps][:, : 2 * case.beam.modes : 2]
+
+
+# Tolerances and the penalty are relative to the largest deflection without commands.
+LP_TOLERANCE = 1e-9  # feasibility tolerance of the solver
+VIOLATION_TOLERANCE = 1e-7  # rows violated by less are not added
+ACTIVITY_PENALTY = 1e-6  # on a change of a command, or its mean absolute value, of its scale
+FIRST_ROWS = 0.5  # deflection without commands above which rows are in the first round
+MAX_ROUNDS = 100  # of adding rows; about five are usual
+HIGHS_METHODS = ("highs", "highs-ipm")  # the simplex method fails on some programs
+SOLVED, INFEASIBLE = 0, 2  # status of linprog
+
+
+def least_peak(
+    influence: InputInfluence,
+    low: Float[np.ndarray, " actuator"],
+    high: Float[np.ndarray, " actuator"],
+    max_change: Float[np.ndarray, " actuator"],
+) -> tuple[float, Float[np.ndarray, "hold actuator"], Float[np.ndarray, "time position"]]:
+    """Least peak (m), commands that attain it to 1e-5, and multipliers of the deflections.
+
+    Commands stay between `low` and `high` and change by at most `max_change` from hold to hold,
+    starting from zero.
+
+    Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
+    """
+    program = _LinearProgram(influence, low, high, max_change)
+    commands, peak = np.zeros(influence.response.shape[2:]), FIRST_ROWS
+    for _ in range(MAX_ROUNDS):
+        if not program.add_violated_rows(commands, peak):
+            break
+        peak, commands, _ = program.solve(ACTIVITY_PENALTY)
+    else:
+        raise RuntimeError(
+            f"the linear program of the bound has not converged in {MAX_ROUNDS} rounds"
+        )
+    # With a part of the rows the optimum is at most the least peak: a bound in any case.
+    peak, _, multipliers = program.solve(0.0)
+    # The solver meets limits to its tolerance; the commands meet them exactly.
+    changes = np.clip(np.diff(commands, axis=0, prepend=0.0), -max_change, max_change)
+    return (
+        peak * program.deflection_scale,
+        np.clip(np.cumsum(changes, axis=0), low, high),
+        multipliers,
+    )
+
+
+class _LinearProgram:
+    """Linear program in scaled unknowns, with the rows added so far."""
+
+    def __init__(self, influence, low, high, max_change):
+        self.influence = influence
+        self.shape = influence.response.shape[2:]
+        self.deflection_scale = np.max(np.abs(influence.unforced @ influence.deflection_rows.T))
+        self.command_scale = _command_scales(influence, low, high, self.deflection_scale)
+        self.low, self.high, self.max_change = (
+            part / self.command_scale for part in (low, high, max_change)
+        )
+        # Rows so far: time index, position index, sign of the deflection.
+        self.generated_rows = np.zeros((3, 0), int)
+
+    def add_violated_rows(self, commands, peak) -> bool:
+        """Add rows at local maxima along the beam where the deflection exceeds a peak.
+
+        Returns whether there are any.
+        """
+        deflection = self.influence.deflection(commands) / self.deflection_scale
+        size = np.abs(deflection)
+        padded = np.pad(size, ((0, 0), (1, 1)), constant_values=-1.0)
+        local_maxima = (size >= padded[:, :-2]) & (size > padded[:, 2:])
+        time_index, position_index = np.nonzero(local_maxima & (size > peak + VIOLATION_TOLERANCE))
+        new_rows = np.stack(
+            [
+                time_index,
+                position_index,
+                np.sign(deflection[time_index, position_index]).astype(int),
+            ]
+        )
+        self.generated_rows = np.concatenate([self.generated_rows, new_rows], axis=1)
+        return time_index.size > 0
+
+    def solve(self, activity_penalty: float):
+        """Scaled peak, commands and multipliers that minimise the peak plus activity penalties.
+
+        Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
+        """
+        holds, actuators = self.shape
+        count = holds * actuators
+        penalties = [0.0, activity_penalty, activity_penalty / holds, 1.0]
+        cost = np.repeat(penalties, [count, count + actuators, count, 1])
+        matrix, right_side = self._constraints()
+        options = {
+            "primal_feasibility_tolerance": LP_TOLERANCE,
+            "dual_feasibility_tolerance": LP_TOLERANCE,
+        }
+        bounds = self._bounds()
+        for method in HIGHS_METHODS:
+            solution = scipy.optimize.linprog(
+                cost, matrix, right_side, bounds=bounds, method=method, options=options
+            )
+            if solution.status in (SOLVED, INFEASIBLE):
+                break
+        if solution.status == INFEASIBLE:
+            raise ValueError(
+                "no commands, starting from zero, meet limits and rates of the actuators"
+            )
+        if solution.status != SOLVED:
+            raise RuntimeError(f"the linear program of the bound failed: {solution.message}")
+        multipliers = np.zeros((self.influence.times.size, self.influence.deflection_rows.shape[0]))
+        when, where, sign = self.generated_rows
+        row_multipliers = solution.ineqlin.marginals[right_side.size - sign.size :]
+        np.add.at(multipliers, (when, where), -sign * row_multipliers)
+        return (
+            solution.x[-1],
+            solution.x[:count].reshape(self.shape) * self.command_scale,
+            multipliers,
+        )
+
+    def _constraints(self):
+        """Rows for changes and absolute values of commands, then for deflections; right side."""
+        sp = scipy.sparse
+        holds, actuators = self.shape
+        # Commands start from zero; the penalty on changes includes the return to zero at the end.
+        difference = sp.eye(holds + 1, holds) - sp.eye(holds + 1, holds, k=-1)
+        difference, identity = sp.kron(difference, sp.eye(actuators)), sp.eye(holds * actuators)
+        change = sp.eye(difference.shape[0])
+        when, where, sign = self.generated_rows
+        rows = self.influence.deflection_rows[where] * sign[:, None] / self.deflection_scale
+        response = (
+            np.einsum("im,imka->ika", rows, self.influence.response[when]) * self.command_scale
+        )
+        unforced = np.sum(rows * self.influence.unforced[when], axis=1)
+        peak_rows = sp.csr_array(response.reshape(sign.size, holds * actuators))
+        blocks = [
+            [difference, -change, None, None],
+            [-difference, -change, None, None],
+            [identity, None, -identity, None],
+            [-identity, None, -identity, None],
+            [peak_rows, None, None, -np.ones((sign.size, 1))],
+        ]
+        matrix = sp.block_array(blocks).tocsr()
+        return matrix, np.concatenate([np.zeros(matrix.shape[0] - sign.size), -unforced])
+
+    def _bounds(self):
+        holds, actuators = self.shape
+        unlimited = np.full(actuators, np.inf), np.full(holds * actuators, np.inf), [np.inf]
+        high = np.concatenate(
+            [np.tile(self.high, holds), np.tile(self.max_change, holds), *unlimited]
+        )
+        low = np.zeros(high.size)
+        low[: holds * actuators] = np.tile(self.low, holds)
+        return np.stack([low, high], axis=1)
+
+
+def _command_scales(influence, low, high, deflection_scale):
+    """Scale of each command: its larger limit, or that which deflects the beam as the loads do."""
+    largest_rows = np.abs(influence.deflection_rows).max(axis=0)
+    deflection_per_command = largest_rows @ np.abs(influence.response).max(axis=(0, 2))
+    scales = np.where(
+        deflection_per_command > 0,
+        deflection_scale / np.where(deflection_per_command > 0, deflection_per_command, 1.0),
+        1.0,
+    )
+    largest = np.maximum(np.abs(low), np.abs(high))
+    return np.where(np.isfinite(largest) & (largest > 0), largest, scales)
+
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller
 

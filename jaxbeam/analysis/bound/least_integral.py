@@ -14,14 +14,13 @@ import scipy  # loads its parts on first use
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.bound.bound import checked_influence, held_command_limits
-from jaxbeam.analysis.bound.input_influence import InputInfluence
+from jaxbeam.analysis.bound.bound import InputInfluence, checked_influence, held_command_limits
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.control.feedforward import Prescribed
-from jaxbeam.model.channels import accepts_commands
+from jaxbeam.model.frequency_responses import accepts_commands
 from jaxbeam.numerics.qp import STATUS_TEXT, solve_qp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Module
 from jaxbeam.simulation.record import Record
 
 REGULARISATION = 1e-10  # on squared commands, of the largest effect of one: some have no effect

@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.display import ReprWithUnits
-from jaxbeam.runtime.arrays import Array, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, xp
 
 
 class Attachment(Module):

@@ -261,7 +261,7 @@ class Electrodynamic(AbstractActuator):
     With an `inner_loop` the amplifier sets the voltage, and the command is a current in A
     (`CurrentLoop`) or a force in N (`ForceLoop`), bounded by the `limits` of the loop. Where the
     amplifier runs out of voltage is not modelled: `limits` of the voltage are refused with a loop;
-    the voltage of a run is in `jaxbeam.simulation.derived_histories`, that per command in
+    the voltage of a run is in `jaxbeam.analysis.sections`, that per command in
     `jaxbeam frf`.
 
     >>> import jaxbeam as jb

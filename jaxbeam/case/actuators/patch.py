@@ -6,7 +6,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
-from jaxbeam.case.declared_checks import validate_direct_or_derived
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
@@ -16,6 +15,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
     part,
+    validate_direct_or_derived,
 )
 from jaxbeam.runtime.arrays import Array, Number, xp
 

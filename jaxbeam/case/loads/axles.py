@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case import fields
-from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
@@ -16,6 +15,7 @@ from jaxbeam.case.fields import (
     concrete,
     is_concrete,
     number,
+    suggestion,
 )
 from jaxbeam.case.loads.base import AbstractRowLoad, AbstractVehicleLoad, length_error, plain_wheels
 from jaxbeam.case.trajectory import StandingTrajectory

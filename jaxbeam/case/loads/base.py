@@ -22,16 +22,21 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case import fields
-from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.display import ReprWithUnits
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import (
+    INCREASING,
+    NOT_NEGATIVE,
+    concrete,
+    is_concrete,
+    number,
+    validate_exactly_one,
+)
 from jaxbeam.case.trajectory import (
     AbstractPiecewiseTrajectory,
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import Array, Number, cholesky, solve, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, Number, cholesky, solve, xp
 
 _LOAD_TOLERANCE = 1e-9  # of the mean wheel load: a smaller one carries nothing
 

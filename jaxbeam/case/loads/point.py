@@ -5,8 +5,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.declared_checks import validate_exactly_one
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number, validate_exactly_one
 from jaxbeam.case.loads.base import (
     AbstractLoad,
     AbstractVehicleLoad,

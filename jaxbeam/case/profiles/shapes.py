@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
-from jaxbeam.runtime.arrays import Array, Number, set_at, solve_tridiagonal, take, xp
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, Number, set_at, solve_tridiagonal, take, xp
 
 Heights = tuple[Float[Array, "*x"], Float[Array, "*x"], Float[Array, "*x"]]
 

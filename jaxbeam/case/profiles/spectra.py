@@ -24,8 +24,7 @@ from jaxbeam.case.profiles.shapes import (
     Heights,
     smooth_step,
 )
-from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_numpy, scan, xp, zeros
-from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.arrays import Array, Module, Number, checkpoint, is_numpy, scan, xp, zeros
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
 BLOCK = 16  # waves computed together then: memory does not grow with their number

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import UsageError, refuse_option
 from jaxbeam.cli.options import PrintOptions, enable_compile_cache, table
 

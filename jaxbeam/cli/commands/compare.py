@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import check_exists, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, DrawingOptions, Output, Over, table
 
@@ -143,7 +143,7 @@ def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
 
 def _report_faults(case, laws, period, options: CaseOptions) -> None:
     """Report the worst peaks of the controllers under each fault."""
-    from jaxbeam.analysis.loop_faults import compare_under_faults
+    from jaxbeam.analysis.compare import compare_under_faults
     from jaxbeam.case.validation import check_case
 
     check_case(case)

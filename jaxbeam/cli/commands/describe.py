@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.options import (
     DrawingOptions,
     OutputOptions,
@@ -52,7 +52,7 @@ def describe(
     elif "beam" in content or "loads" in content:
         results = _of_case(source)
     else:
-        from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
+        from jaxbeam.case.loads.vehicles import load_vehicle
 
         vehicle = load_vehicle(Path(source))
         title = vehicle.title or Path(source).stem
@@ -119,8 +119,8 @@ def settlement_words(case: "Case") -> list[str]:
 
     from jaxbeam.case.display import with_prefix
     from jaxbeam.model.along_beam import positions_along, sections
-    from jaxbeam.model.settlement import has_settlement, settled_beam
     from jaxbeam.model.static_correction import bending_moment
+    from jaxbeam.model.transfer_matrices import has_settlement, settled_beam
 
     if not has_settlement(case):
         return []
@@ -174,7 +174,7 @@ def _sensor_words(case: "Case") -> list[str]:
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
     """Loads of a case, or one of a vehicle file, a vehicle or a train."""
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
+    from jaxbeam.case.loads.vehicles import VehicleLoad
     from jaxbeam.files.case_file import load_case
     from jaxbeam.library.published import trains
 
@@ -186,9 +186,9 @@ def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
 
 
 def _of_library(name: str) -> dict[str, Any]:
-    from jaxbeam.case.declared_checks import suggestion
+    from jaxbeam.case.fields import suggestion
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.vehicles.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.case.loads.vehicles import load_vehicle, vehicle_names
     from jaxbeam.library.published import trains
 
     if name in trains():
@@ -268,7 +268,7 @@ def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
 
 
 def _list_library(options: PrintOptions) -> None:
-    from jaxbeam.case.loads.vehicles.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.case.loads.vehicles import load_vehicle, vehicle_names
     from jaxbeam.library.published import line_loads, trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import check_suffix, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
 from jaxbeam.files.endings import TABLES
@@ -145,7 +145,7 @@ def envelope(
     parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
-    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.case.toml_file import number_in_si
     from jaxbeam.model.statics import REACTION
 
     lane_load = None if lane is None else number_in_si(lane, "N/m", "--lane")
@@ -264,7 +264,7 @@ def combine(
 def _sections(case: "jb.Case", quantity: str, at: tuple[str, ...]) -> tuple[dict, list[float]]:
     """Names of characteristic points by position (m), and positions of sections of a quantity."""
     from jaxbeam.analysis.sections import characteristic_points
-    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.case.toml_file import number_in_si
     from jaxbeam.model.statics import REACTION, held_positions
 
     places = {point.x: point.name for point in characteristic_points(case)}
@@ -311,7 +311,7 @@ def influence(
     parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.analysis.sections import influence_table
-    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.case.toml_file import number_in_si
 
     sections = tuple(number_in_si(text, "m", "--at") for text in at)
     found = influence_table(

@@ -184,7 +184,7 @@ def state_space(
     options.check_outputs(output)
     parsed_case = options.read(case, judged="structure")
 
-    from jaxbeam.files.matrices import matrices_of, write_state_space
+    from jaxbeam.files.tables import matrices_of, write_state_space
 
     plant = jb.state_space(parsed_case, coordinates)
     system = plant.unloaded if time is None else plant.at(time)

@@ -207,8 +207,7 @@ def _priors(bounds, normals, scales) -> dict:
 def _assess(fit, profile, draws, sampling, validate, output, resume) -> dict:
     """Profiles, posterior and cross-validation of a fit, as far as they are asked for."""
     from tuning.fit.model_validation import cross_validate
-    from tuning.fit.uncertainty.posterior import sample
-    from tuning.fit.uncertainty.profile import profile as profile_of
+    from tuning.fit.uncertainty import profile as profile_of, sample
 
     assessment = {"profiles": [profile_of(fit, address) for address in profile]}
     if validate:

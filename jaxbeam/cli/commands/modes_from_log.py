@@ -143,7 +143,7 @@ def modes_from_log(
         options.check_case(case)
 
     import tuning
-    from tuning.modal.setups.merge import logs_of_setups
+    from tuning.modal.setups import logs_of_setups
 
     read = list(map(reading.read, logs))
     if align:

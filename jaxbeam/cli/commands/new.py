@@ -4,7 +4,7 @@ import json
 from importlib import resources
 from pathlib import Path
 
-from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import refuse_option
 from jaxbeam.cli.options import Output, OutputOptions
 from jaxbeam.runtime.output_file import whole_file

@@ -46,7 +46,7 @@ def simulate(
     """
     check_suffix(output, ".nc", "a record", RESULTS)
     if animate:
-        from jaxbeam.plot.traffic.moving import check_film
+        from jaxbeam.plot.animation import check_film
 
         check_film(animate)
     picture = pictures.path(output, case)
@@ -78,7 +78,7 @@ def simulate(
         lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
-        from jaxbeam.analysis.margins import stability_margin
+        from jaxbeam.analysis.stability import stability_margin
 
         margin = stability_margin(parsed_case, verdict_only=True)
         content["stability"] = margin.verdict

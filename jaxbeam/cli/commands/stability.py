@@ -9,7 +9,7 @@ from jaxbeam.cli.options import CaseOptions, PictureOptions, table
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.linearised_loop import LinearisedLoop
-    from jaxbeam.analysis.margins import Margins
+    from jaxbeam.analysis.stability import Margins
 
 
 def stability(
@@ -48,12 +48,12 @@ def stability(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.linearised_loop import linearised_loop
-    from jaxbeam.analysis.margins import stability_margin
     from jaxbeam.analysis.stability import (
         frozen_poles,
         growth,
         largest_frozen_pole,
         load_stability_limits,
+        stability_margin,
         stream,
         stream_excess,
     )
@@ -162,7 +162,7 @@ def _margins_of(loop: "LinearisedLoop") -> list["Margins"]:
     """Margins at each command; none of an unstable loop."""
     import numpy as np
 
-    from jaxbeam.analysis.margins import margins
+    from jaxbeam.analysis.stability import margins
 
     if loop.poles().real.max() >= 0:
         return []

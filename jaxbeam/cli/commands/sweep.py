@@ -150,8 +150,8 @@ def sweep(
 
 def _with_run_up(case: "jb.Case", values: dict) -> "jb.Case":
     """Case whose vehicles start far enough before the bridge for all swept speeds."""
-    from jaxbeam.analysis.run_up import with_run_up
-    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.analysis.critical_speeds import with_run_up
+    from jaxbeam.case.toml_file import number_in_si
 
     given = [one for name, own in values.items() if name.endswith(".speed") for one in own]
     return with_run_up(case, speeds=[number_in_si(one, "m/s", "speed") for one in given])
@@ -164,7 +164,7 @@ def _several(values: dict) -> set[str]:
 
 def _limits(case: "jb.Case", given: Sequence[str]) -> dict[str, float]:
     """Limits by quantity, in SI units, of QUANTITY=VALUE."""
-    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.case.toml_file import number_in_si
 
     units, limits = {sensor.quantity: sensor.unit for sensor in case.sensors}, {}
     for text in given:

@@ -226,7 +226,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     if picture:
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
-    from jaxbeam.analysis.margins import stability_margin
+    from jaxbeam.analysis.stability import stability_margin
     from tuning.control.tuning_result import hand_drawn_sentence
 
     summaries, closed = [one.to_dict() for one in tuned], []

@@ -7,6 +7,7 @@ t. What follows from them (first frequency, static deflection, mass ratio, criti
 import collections
 import contextvars
 import dataclasses
+import functools
 import itertools
 import math
 import warnings
@@ -16,10 +17,12 @@ from fnmatch import fnmatch
 import jax
 import numpy as np
 
-from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.case import Case, concrete_case, structure_of
 from jaxbeam.case.fields import all_concrete, concrete, refuses_traced
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.modes import Modes, modes
+from jaxbeam.model import modes as beam_modes
+from jaxbeam.model.layout import Layout
+from jaxbeam.model.modes import Modes
 from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers
 from jaxbeam.model.plausibility.ranges import ADVICE, RANGES, Range
 
@@ -116,6 +119,14 @@ def _warnings_of(case: Case, found: Modes | None = None) -> tuple[str, ...] | No
     return sentences
 
 
+@functools.wraps(beam_modes.modes)
+def modes(case: Case, layout: Layout | None = None) -> Modes:
+    """`jaxbeam.model.modes.modes`, with warnings of implausible numbers; documented there."""
+    found = beam_modes.modes(case, layout)
+    warn_if_implausible(structure_of(case), found)
+    return found
+
+
 def leave_warnings_to_caller() -> None:
     """Silence `warn_if_implausible` in this context, whose caller shows the warnings of `check`."""
     _SHOWN.set(True)
@@ -136,7 +147,7 @@ _SHOWN = contextvars.ContextVar("plausibility_shown", default=False)
 def _checked(
     case: Case, found: Modes | None = None, rows: tuple[Range, ...] = RANGES
 ) -> Plausibility:
-    found = modes(_with_few_modes(case)) if found is None else found
+    found = beam_modes.modes(_with_few_modes(case)) if found is None else found
     numbers = plausible_numbers(case, found)
     return dataclasses.replace(numbers, warnings=tuple(_sentences(rows, case, found, numbers)))
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.beam import END_CONDITIONS, Support, segment_edges
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes

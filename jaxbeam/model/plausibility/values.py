@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import NODE_TOLERANCE
-from jaxbeam.model.linear_system import poles
 from jaxbeam.model.plausibility.facts import GRAVITY, Facts, compliance
+from jaxbeam.model.state_space import poles
 
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500

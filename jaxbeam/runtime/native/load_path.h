@@ -125,7 +125,7 @@ static void load_path(const Workspace *w, const Step *step) {
 }
 
 /* Static influence of a load on the outputs at the peak nodes of a step, added to its sample rows:
- * model/sensing/output_rows.py, `LoadInfluence`. No step contains a break inside. */
+ * model/output_rows.py, `LoadInfluence`. No step contains a break inside. */
 static void add_influence(const Workspace *w, const Step *step, int s) {
     const double *breaks = w->inputs[INFLUENCE_BREAKS];
     double position, speed, acceleration;

@@ -13,9 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, linprog
 
 import jaxbeam as jb
-from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.analysis.bound.input_influence import input_influence
-from jaxbeam.analysis.bound.linear_program import least_peak
+from jaxbeam.analysis.bound.bound import bound, input_influence, least_peak
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.modules import DATA as DATA_FOLDER
 

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.bound.bound import bound
-from jaxbeam.analysis.bound.input_influence import InputInfluence
-from jaxbeam.analysis.bound.linear_program import least_peak
+from jaxbeam.analysis.bound.bound import InputInfluence, bound, least_peak
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.modules import DATA
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
-from jaxbeam.analysis.bound.input_influence import input_influence
+from jaxbeam.analysis.bound.bound import input_influence
 from jaxbeam.analysis.bound.least_integral import least_integral
 
 LIMITS, PERIOD = [-1.0, 1.5], 0.015

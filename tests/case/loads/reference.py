@@ -4,8 +4,7 @@ import json
 
 import numpy as np
 
-from jaxbeam.case.loads.vehicles.cars import HalfCar, Oscillator, QuarterCar, Wagon
-from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
+from jaxbeam.case.loads.vehicles import HalfCar, Oscillator, QuarterCar, VehicleLoad, Wagon
 from tests.modules import ROOT
 
 REFERENCE = json.loads((ROOT / "tests" / "data" / "vehicles.json").read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
+from jaxbeam.case.loads.vehicles import load_vehicle
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.library.published import trains

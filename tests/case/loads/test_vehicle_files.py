@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.loads.vehicles.vehicle import check_vehicle, load_vehicle, vehicle_names
+from jaxbeam.case.loads.vehicles import check_vehicle, load_vehicle, vehicle_names
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import (
     case_from_dict,

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.loads.vehicles.cars import Oscillator, QuarterCar
-from jaxbeam.case.loads.vehicles.vehicle import PlanarVehicle, check_vehicle, load_vehicle
-from jaxbeam.case.loads.vehicles.vehicle_parts import (
+from jaxbeam.case.loads.vehicle_parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
+)
+from jaxbeam.case.loads.vehicles import (
+    Oscillator,
+    PlanarVehicle,
+    QuarterCar,
+    check_vehicle,
+    load_vehicle,
 )
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, load_case, save_case

@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.case import replace, unit_at, value_at
 from jaxbeam.case.validation import check_case
-from jaxbeam.files.case_file import case_to_dict, with_settings
-from jaxbeam.files.profile_file import profile_from_file
+from jaxbeam.files.case_file import case_to_dict, profile_from_file, with_settings
 
 BEAM = jb.Beam(length=25.0, flexural_rigidity=1e10, mass_per_length=1e4)
 LOADS = [jb.MovingMass(1000.0, speed=20.0)]

@@ -16,11 +16,10 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.linalg import block_diag, solve_continuous_are
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_gains import crossing_events, with_crossing_load
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.crossing_gains import crossing_events, with_crossing_load
+from jaxbeam.control.lqr import LQR
 from jaxbeam.control.state_controller import TrueState
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles

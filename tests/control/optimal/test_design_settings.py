@@ -21,8 +21,8 @@ from scipy.linalg import block_diag, solve_continuous_are
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles, stability_limit
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.lqr import LQR
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import LENGTH, MASS, SPEED, shaker_case, state_matrices

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.h_infinity import minimax_law
+from jaxbeam.control.h_infinity import minimax_law
 from tests.differences import central
 
 SIZES = {"output_size": 2e-4, "command_size": 4.0, "force_size": 4.0, "noise_size": 1e-5}

@@ -11,12 +11,11 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.h_infinity import Game, is_attained, least_level, minimax_law
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.h_infinity import Game, is_attained, least_level, minimax_law
+from jaxbeam.control.lqr import LQR
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.runtime.arrays import xp
 from tests.differences import central
 from tests.loop_as_oracle import span_of

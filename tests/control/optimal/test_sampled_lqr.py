@@ -18,8 +18,8 @@ from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
-from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.optimal.sampled_lqr import (
+from jaxbeam.control.lqr import LQR
+from jaxbeam.control.sampled_lqr import (
     SamplingWarning,
     discrete_lq_problem,
     sampled_reachability,

@@ -10,16 +10,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.crossing_gains import GainSchedule, PositionGainLaw
 from jaxbeam.control.load_identification import identified_load
-from jaxbeam.control.optimal.crossing_gains import GainSchedule, PositionGainLaw
-from jaxbeam.control.optimal.lqr import LQR
+from jaxbeam.control.lqr import LQR
 from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.numerics.finite_horizon import GainTable
 from tests.differences import central
 
 WEIGHTS = {

@@ -11,10 +11,9 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.predictive.mpc import TerminalSetWarning
+from jaxbeam.control.mpc import TerminalSetWarning
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.qp import solve_qp
 from tests.differences import central

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.predictive.gpc import (
+from jaxbeam.control.gpc import (
     PolynomialModel,
     lift_and_delay,
     polynomial_model,

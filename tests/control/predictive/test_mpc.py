@@ -19,8 +19,8 @@ from scipy.optimize import lsq_linear
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.predictive.prediction import incremental_model
+from jaxbeam.control.prediction import incremental_model
+from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.riccati import dlqr

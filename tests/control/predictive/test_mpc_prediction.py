@@ -11,9 +11,8 @@ import scipy.linalg
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.estimator import Estimate
-from jaxbeam.control.predictive.prediction import (
+from jaxbeam.case.controller import Estimate, Measurement
+from jaxbeam.control.prediction import (
     SampledPlant,
     incremental_model,
     move_basis,

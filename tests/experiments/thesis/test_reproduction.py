@@ -14,7 +14,6 @@ from experiments.thesis import page, reproduction, results_tables
 from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit_rig
 from experiments.thesis.chapter5 import published as chapter5
 from experiments.thesis.chapter6 import published as chapter6
-from experiments.thesis.published_numbers import YES_OR_NO, PublishedNumbers, Tolerance
 from experiments.thesis.report import ALL_VERDICTS
 from experiments.thesis.verdicts import (
     EXPLAINED,
@@ -26,6 +25,9 @@ from experiments.thesis.verdicts import (
     REPEATED,
     REPRODUCED,
     STATEMENT,
+    YES_OR_NO,
+    PublishedNumbers,
+    Tolerance,
     assign_verdicts,
     likeliest_reading,
     make_finding,

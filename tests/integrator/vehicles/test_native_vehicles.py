@@ -16,7 +16,7 @@ from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import static_shapes
 

@@ -11,14 +11,19 @@ import scipy.signal
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.case.filters import Filter
-from jaxbeam.case.quantities import QUANTITIES as ROW_QUANTITIES, TWIST, Quantity, quantity_of
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.sensors import (
+    QUANTITIES as ROW_QUANTITIES,
+    TWIST,
+    Filter,
+    Quantity,
+    Sensor,
+    quantity_of,
+)
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import band_weights, modal_row, quantity_history, sensor_rows
-from jaxbeam.model.sensing.sensor_signals import (
+from jaxbeam.model.output_rows import band_weights, modal_row, quantity_history, sensor_rows
+from jaxbeam.model.sensor_signals import (
     filtered_reading,
     initial_filter_state,
     noise_samples,

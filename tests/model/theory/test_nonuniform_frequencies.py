@@ -14,9 +14,8 @@ import jaxbeam as jb
 from jaxbeam.case.beam import rayleigh_coefficients
 from jaxbeam.case.case import replace, value_at
 from jaxbeam.model.layout import find_layout
-from jaxbeam.model.modes import mesh_layout, modes
-from jaxbeam.model.theory.damping import safe_sqrt
-from jaxbeam.model.theory.statics import critical_axial_force
+from jaxbeam.model.modes import mesh_layout, modes, safe_sqrt
+from jaxbeam.model.transfer_matrices import critical_axial_force
 from tests.differences import central
 from tests.modules import ROOT
 from tests.oracles.closed_forms import ShootingBeam

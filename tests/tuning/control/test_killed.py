@@ -14,7 +14,7 @@ from tests.tuning.stand_in import fit, least_squares
 from tuning import checkpoint
 from tuning.checkpoint import Checkpoint
 from tuning.fit.least_squares import multi_start
-from tuning.fit.uncertainty.posterior import sample
+from tuning.fit.uncertainty import sample
 
 # Code of a process that is killed once it has written its first checkpoint.
 CHILD = """
@@ -25,7 +25,7 @@ from tests.tuning import stand_in
 from tests.tuning.control import test_killed
 from tuning.checkpoint import Checkpoint
 from tuning.fit.least_squares import multi_start
-from tuning.fit.uncertainty.posterior import sample
+from tuning.fit.uncertainty import sample
 file = Path(sys.argv[1])
 save = tuning.checkpoint.save
 def save_and_die(path, digest, arrays):

@@ -20,7 +20,7 @@ from tuning.control import run_set
 from tuning.control.load_cases import run_case, run_cases
 from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import make_run_set
-from tuning.fit.uncertainty.posterior import Posterior
+from tuning.fit.uncertainty import Posterior
 
 GAIN = "controller.gains.0"
 CAR = {

@@ -9,7 +9,7 @@ import pytest
 import jaxbeam as jb
 import tuning
 import tuning.fit.result
-from jaxbeam.analysis import margins
+from jaxbeam.analysis import stability
 from jaxbeam.cli import main
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import dataset, fit, least_squares
@@ -107,8 +107,8 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     class Reduced:
         tuned = Result()
 
-    margin = margins.StabilityMargin(2.0, 0.1)
-    monkeypatch.setattr(margins, "stability_margin", lambda case: margin)
+    margin = stability.StabilityMargin(2.0, 0.1)
+    monkeypatch.setattr(stability, "stability_margin", lambda case: margin)
     monkeypatch.setattr(tuning.control, "lexicographic", lexicographic)
     monkeypatch.setattr(tuning.control, "tune_reduced", tune_reduced)
     monkeypatch.setattr(tuning.control, "tune_integers", tune_integers)

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.controller import Measurement
+from jaxbeam.control.feedforward import hand_drawn_law
 from jaxbeam.model.deflection_lines import influence_line
 from tests.tuning.small_rig import GAIN, rig
 from tuning.control.load_cases import run_case

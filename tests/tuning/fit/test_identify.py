@@ -10,7 +10,7 @@ import scipy.stats
 import jaxbeam as jb
 import tuning
 from jaxbeam.case.case import replace, value_at
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.cli import main
 from tests.cli.example import CONTROLLED_CASE
 from tests.differences import well_compiled
@@ -31,8 +31,7 @@ from tests.tuning.finite_element_rigs import (
 )
 from tuning import Fit, Log, identify
 from tuning.fit.dataset import make_dataset
-from tuning.fit.least_squares import LeastSquares
-from tuning.fit.uncertainty.covariance import t_quantile
+from tuning.fit.least_squares import LeastSquares, t_quantile
 from tuning.parameters.free import free_parameters, to_unbounded
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)

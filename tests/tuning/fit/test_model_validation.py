@@ -30,13 +30,18 @@ from tests.tuning.stand_in import (
 from tuning.checkpoint import Checkpoint, save
 from tuning.fit import model_validation, result
 from tuning.fit.dataset import channel_residuals, residual_remarks, whiteness_p_value
-from tuning.fit.least_squares import LocalMinimum
+from tuning.fit.least_squares import LocalMinimum, t_quantile
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.report import write_report
 from tuning.fit.result import fit_result
-from tuning.fit.uncertainty.covariance import t_quantile
-from tuning.fit.uncertainty.posterior import _log_density, draw_by_nuts, sample, with_diagnostics
-from tuning.fit.uncertainty.profile import Profile, profile
+from tuning.fit.uncertainty import (
+    Profile,
+    _log_density,
+    draw_by_nuts,
+    profile,
+    sample,
+    with_diagnostics,
+)
 from tuning.parameters.free import Prior, to_unbounded
 
 VALUES = np.array(list(TRUTH.values()))

@@ -13,15 +13,15 @@ from tests.oracles.crossing import Load
 from tests.tuning.fit.test_identify import NOISE, simulated_log, small
 from tuning.fit.dataset import make_dataset
 from tuning.fit.experiment_design import design_experiment
-from tuning.fit.least_squares import LeastSquares
-from tuning.fit.result import fit_result
-from tuning.fit.uncertainty.covariance import (
+from tuning.fit.least_squares import (
     REPORTED_CHANGE,
     UNBOUNDED_SD,
+    LeastSquares,
     autocorrelation_factor,
     t_quantile,
     uncertainty,
 )
+from tuning.fit.result import fit_result
 from tuning.parameters.free import free_parameters
 
 NAMES = ["a", "b", "c"]

@@ -15,9 +15,8 @@ from tests.differences import well_compiled
 from tests.oracles import finite_elements, vehicle_elements
 from tuning import Log, load_fit, save_fit
 from tuning.fit.dataset import make_dataset
-from tuning.fit.least_squares import LeastSquares
+from tuning.fit.least_squares import LeastSquares, t_quantile
 from tuning.fit.result import fit_result
-from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.parameters.free import free_parameters
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 20.0, 1e10, 8000.0, 0.02

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 from tests.oracles.planted_structures import Structure, random_structure, response
 from tuning import Log, ModalSettings, identify_modes
 from tuning.logs import find_faults, mask
-from tuning.logs.logger import samples_held, sensor_readings, unread
+from tuning.logs.quality import samples_held, sensor_readings, unread
 from tuning.modal.decay.stretches import excited_samples
 
 TIMES = np.arange(600) / 500

@@ -8,7 +8,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.loads.point import MovingMass
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.validation import check_case
 from tests.tuning.small_rig import rig
 from tuning import Log, read_log

@@ -8,15 +8,17 @@ from tests.tuning.modal.test_leaving import mode
 from tests.tuning.modal.test_modal import ambient
 from tuning import ModalSettings, identify_modes
 from tuning.modal.arguments import chosen_modes
-from tuning.modal.likelihood.model import (
+from tuning.modal.likelihood import (
     SpectralModel,
+    Start,
     Window,
     _moved,
+    _places,
     expectation,
     information,
+    refine_modes,
     with_cost,
 )
-from tuning.modal.likelihood.refine import Start, _places, refine_modes
 
 
 def two_modes():

@@ -14,8 +14,7 @@ from tuning.modal import merge_setups
 from tuning.modal.fit import ModalFit
 from tuning.modal.harmonics import Line
 from tuning.modal.result import IdentifiedMode, mac_matrix
-from tuning.modal.setups.merge import logs_of_setups
-from tuning.modal.setups.shape import Part, whole_shape
+from tuning.modal.setups import Part, logs_of_setups, whole_shape
 
 SHAPES = np.array([[0.6, 1.0, 0.7, 0.2, -0.3], [1.0, 0.1, -0.8, -0.6, 0.4]])
 

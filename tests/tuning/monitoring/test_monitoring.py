@@ -20,9 +20,9 @@ from tuning.monitoring.history import (
     analyse,
     read_conditions,
     read_history,
+    tracks_of,
 )
 from tuning.monitoring.monitor import monitor, monitored
-from tuning.monitoring.tracks import tracks_of
 
 FREQUENCIES = np.array([2.1, 5.9, 6.4])  # Hz
 SHAPES = np.array([[0.6, 1.0, 0.7], [1.0, 0.1, -0.9], [0.8, -0.9, 0.7]])

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.clocks import STARTS, clocks_by_numbers
 from tuning.logs.readers.headings import epoch_seconds, is_stamp
 from tuning.logs.readers.table import (
@@ -13,7 +14,6 @@ from tuning.logs.readers.table import (
     table_of,
     text_attribute,
 )
-from tuning.optional import import_extra
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 MATLAB_MAGIC = b"MATLAB 7.3 MAT-file"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.clocks import Clock
 from tuning.logs.readers.table import (
     LogFormat,
@@ -19,7 +20,6 @@ from tuning.logs.readers.table import (
     read_bytes,
     table_of,
 )
-from tuning.optional import import_extra
 
 EVEN = 1e-3  # of a step: times that differ by less from equal steps have them
 

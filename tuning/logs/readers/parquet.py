@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
@@ -11,7 +12,6 @@ from tuning.logs.readers.table import (
     table_of,
     text_attribute,
 )
-from tuning.optional import import_extra
 
 MAGIC = b"PAR1"
 

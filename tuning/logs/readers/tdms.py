@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.clocks import Clock, clocks_of
 from tuning.logs.readers.table import (
     LogFormat,
@@ -16,7 +17,6 @@ from tuning.logs.readers.table import (
     table_of,
     text_attribute,
 )
-from tuning.optional import import_extra
 
 MAGIC = b"TDSm"
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.clocks import Clock, join_channels
 from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, read_bytes
-from tuning.optional import import_extra
 
 MAGIC = b"    -1\n"
 MAGICS = (MAGIC, MAGIC.replace(b"\n", b"\r\n"), MAGIC.replace(b"\n", b" "))

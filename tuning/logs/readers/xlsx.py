@@ -3,9 +3,9 @@
 import datetime
 from pathlib import Path
 
+from jaxbeam.files.endings import import_extra
 from tuning.logs.readers.headings import find_headings, is_numeric, table_of_rows
 from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error
-from tuning.optional import import_extra
 
 MAGIC = b"PK\x03\x04"
 

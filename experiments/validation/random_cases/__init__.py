@@ -1,1 +1,0 @@
-"""Random valid cases under stress: stated errors and verdicts beside independent integrations."""

@@ -1,1 +1,0 @@
-"""TOML files, and parts of a case from their tables."""

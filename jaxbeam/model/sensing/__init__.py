@@ -1,1 +1,0 @@
-"""What sensors measure: rows of quantities, signals, filters and readings."""

@@ -1,1 +1,0 @@
-"""Beams that are not uniform: sections, Ritz elements, statics, buckling, fields of the modes."""

@@ -1,1 +1,0 @@
-"""Uncertainty of fitted parameters: covariance, profile likelihood, posterior."""
