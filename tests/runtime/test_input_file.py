@@ -253,6 +253,7 @@ BY_THEMSELVES = (
     "jaxbeam.files.export.files",
     "jaxbeam.files.report",  # of the package
     "jaxbeam.files.netcdf",
+    "jaxbeam.model.plausibility.check",  # of the package
     "jaxbeam.sweeps.store",  # after `check_codecs`
     "tuning.logs.readers.table",
     "tuning.logs.readers.tdms",

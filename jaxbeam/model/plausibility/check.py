@@ -1,4 +1,4 @@
-"""Check of a case before it runs, by the table of plausible ranges.
+"""Check of a case before it runs, by the table of plausible ranges, `ranges.toml`.
 
 Wrong units make a case that computes and means nothing: E I in kN m^2, a speed in km/h, a mass in
 t. What follows from them (first frequency, static deflection, mass ratio, critical speed) shows it.
@@ -10,9 +10,12 @@ import dataclasses
 import functools
 import itertools
 import math
+import tomllib
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from fnmatch import fnmatch
+from importlib import resources
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -23,11 +26,41 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model import modes as beam_modes
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.modes import Modes
+from jaxbeam.model.plausibility import loads, structure
 from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers
-from jaxbeam.model.plausibility.ranges import ADVICE, RANGES, Range
+from jaxbeam.model.plausibility.structure import Value, part_numbers
 
 MOST_MODES = 60
 LISTS = ("loads", "actuators", "sensors")  # whose parts have causes of their own
+
+
+class Range(NamedTuple):
+    """Row of `ranges.toml`, which says what its entries mean."""
+
+    of: str
+    within: tuple[float, float]
+    says: str
+    below: str = ""
+    above: str = ""
+    unit: str = ""
+    cause: str = ""
+    unless: Sequence[str] = ()
+    over: str = ""
+    kinds: Sequence[str] = ()
+
+    def values(self, facts: Facts) -> Iterator[Value]:
+        """Values of the quantity in a case, with addresses and words."""
+        key, _, names = self.of.partition(": ")
+        if names:
+            return part_numbers(facts, key, *names.split(), over=self.over, kinds=self.kinds)
+        return getattr(structure if hasattr(structure, key) else loads, key)(facts)
+
+
+@functools.cache
+def _rows(kind: str) -> tuple[Range, ...]:
+    """Rows of `ranges.toml` of a kind, "range" or "advice", in their order."""
+    text = (resources.files(__package__) / "ranges.toml").read_text(encoding="utf-8")
+    return tuple(Range(**row) for row in tomllib.loads(text)[kind])
 
 
 class PlausibilityWarning(UserWarning):
@@ -67,7 +100,7 @@ def check(case: Case) -> Plausibility:
     beam.flexural_rigidity: the beam sags by 3.186 m
     """
     check_case(case)
-    return _checked(concrete_case(case), rows=(*RANGES, *ADVICE))
+    return _checked(concrete_case(case), advised=True)
 
 
 def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
@@ -144,11 +177,10 @@ _SHOWN = contextvars.ContextVar("plausibility_shown", default=False)
 
 
 @np.errstate(all="ignore")  # of numbers that no beam has
-def _checked(
-    case: Case, found: Modes | None = None, rows: tuple[Range, ...] = RANGES
-) -> Plausibility:
+def _checked(case: Case, found: Modes | None = None, advised: bool = False) -> Plausibility:
     found = beam_modes.modes(_with_few_modes(case)) if found is None else found
     numbers = plausible_numbers(case, found)
+    rows = _rows("range") + (_rows("advice") if advised else ())
     return dataclasses.replace(numbers, warnings=tuple(_sentences(rows, case, found, numbers)))
 
 
@@ -170,7 +202,7 @@ def _sentences(rows: tuple[Range, ...], *judged) -> Iterator[str]:
         said, fields = set(), set()
         for address, value, words in row.values(facts):
             part, field = _part(address), address.rstrip(".0123456789")
-            if row.low <= value <= row.high or math.isnan(value) or field in fields:
+            if row.within[0] <= value <= row.within[1] or math.isnan(value) or field in fields:
                 continue
             if explained.get(row.cause, set()) & {part, ""}:
                 continue
@@ -192,10 +224,10 @@ def _part(address: str) -> str:
 
 
 def _sentence(row: Range, address: str, value: float, words: dict) -> str:
-    low = value < row.low
+    low = value < row.within[0]
     says, hint = (
         text.format(address=address, value=value, **words)
         for text in (row.says, row.below if low else row.above)
     )
-    bound = f"{'less' if low else 'more'} than {row.low if low else row.high:g} {row.unit}".rstrip()
+    bound = f"{'less' if low else 'more'} than {row.within[0 if low else 1]:g} {row.unit}".rstrip()
     return f"{address}: {says}{f', {bound}' if row.unit else ''}: {hint}"

@@ -277,6 +277,11 @@ class Facts:
         return float(self.case.beam.linear_density)
 
     @property
+    def mass(self) -> float:
+        """Mass of the beam (kg)."""
+        return self.density * self.length
+
+    @property
     def is_bridge(self) -> bool:
         """Whether the beam is as long as a bridge, not as a rig."""
         return self.length >= LEAST_BRIDGE
