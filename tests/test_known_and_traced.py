@@ -129,7 +129,6 @@ def _discrete_model(case, layout):
     return grid, discrete_model(model, grid, case.sensor_positions)
 
 
-PAIR = [("force@0.3", "velocity@0.7")]
 X = np.array([0.1, 0.45, 0.77])
 FUNCTIONS = {
     "modes": lambda case, layout: jb.modes(case, layout),

@@ -117,7 +117,7 @@ def _spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _wheel_positions(case: Case, loads: LoadSet, record: Record, chosen) -> np.ndarray:
+def _wheel_positions(loads: LoadSet, record: Record, chosen) -> np.ndarray:
     """Positions (frame, wheel) in m; NaN where a wheel is not seen."""
     x = np.asarray(concrete(loads.kinematics(np.asarray(record.times)[chosen])[0])).T
     on_beam = np.isfinite(np.asarray(record.load_position)[chosen])
@@ -172,7 +172,7 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "frameTimes": record.times[frames],
         "x": x,
         "beam": record.at(x)[frames],
-        "wheelPositions": _wheel_positions(case, loads, record, frames),
+        "wheelPositions": _wheel_positions(loads, record, frames),
         "bodies": record.body_displacement[frames],
     }
     return words, {name: np.asarray(values) for name, values in arrays.items()}

@@ -396,9 +396,9 @@ def uses(body: str, word: str) -> bool:
     return re.search(rf"\b{word}\b", body) is not None
 
 
-def _wrapped(text: str, width: int = 100) -> str:
-    """Text of an array, wrapped to lines of a width."""
-    return "\n    ".join(textwrap.wrap(text, width - 4, break_long_words=False))
+def _wrapped(text: str) -> str:
+    """Text of an array, wrapped to lines of 100 characters."""
+    return "\n    ".join(textwrap.wrap(text, 96, break_long_words=False))
 
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run

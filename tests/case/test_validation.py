@@ -350,7 +350,6 @@ def test_addresses_that_overlap():
 # Counts of what a case has are limited, and a case beyond a limit is refused at once.
 
 BRIDGE_BEAM = {"length": 20.0, "flexural_rigidity": 1e10, "mass_per_length": 12e3}
-CONVOY = {"kind": "vehicle", "model": "half-truck", "speed": 1.0, "count": 10**9}
 
 
 def test_200_000_sensors_are_refused_at_once():

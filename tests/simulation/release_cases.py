@@ -12,20 +12,6 @@ import jaxbeam as jb
 from tests.c_code.cases import CASES as LOOPS, rig
 from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 
-# Cases whose peaks 0.2.0 found less exactly, by up to 9e-4 of an acceleration: steps are shorter
-# now. Their numbers are later ones, nearer to those with a tolerance of 1e-10 in every part but the
-# largest acceleration and contact force of the mass on a ramp, which differ by up to 7e-6.
-MORE_EXACT = (
-    "open: forces",
-    "a quarter car",
-    "axles with masses",
-    "a half car",
-    "a varying force",
-    "two vehicles meet",
-    "a mass on a ramp",
-    "a load within the run",
-    "an oscillator that brakes",
-)
 # Their answers are those at a tolerance of 1e-12: 0.2.0 chose steps by another error of peaks
 # between them, too small for the mass on a ramp (1.2e-8 in its peak), too large for the half car.
 OTHER_STEPS = ("a mass on a ramp", "a half car")

@@ -118,7 +118,7 @@ def assess(
     length = _determinant_length(bridge, determinant_length)
     frequencies, bridge = _with_counted_modes(bridge, added_damping)
     checks = [
-        frequency_check(bridge, length, frequencies[0]),
+        frequency_check(length, frequencies[0]),
         analysis_check(length, frequencies[0], speed),
         *damping_checks(bridge, added_damping),
         *factor_checks(length, frequencies[0], speed, track),

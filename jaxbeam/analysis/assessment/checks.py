@@ -142,7 +142,7 @@ def largest_under_lm71(line: TabulatedLine) -> float:
     return max(effect)
 
 
-def frequency_check(case: Case, length: float, frequency: float) -> CodeCheck:
+def frequency_check(length: float, frequency: float) -> CodeCheck:
     """Check of the first natural frequency (Hz) against its limits at a determinant length (m)."""
     numbers = code_numbers()["frequency_limits"]
     lower, upper = frequency_limits(length)

@@ -130,7 +130,7 @@ def first_frequency(facts):
 def damping_ratio(facts):
     """Largest modal damping ratio, however it is given; on a track of layers that of the first."""
     beam, name = facts.case.beam, "beam.loss_factor"
-    ratios = facts.modes.damping_ratios[: 1 if layered_tracks(facts) else None]
+    ratios = facts.modes.damping_ratios[: 1 if _layers(facts) else None]
     if beam.rayleigh_damping is not None:
         ratios, name = ratios[:1], "beam.rayleigh_damping"
     elif np.any(beam.damping_ratio):
@@ -466,7 +466,7 @@ def sag_on_foundation(facts):
 # The track of layers
 
 
-def layered_tracks(facts):
+def _layers(facts):
     return [one for _, one in parts_of(facts, "track") if one.layered]
 
 
@@ -476,7 +476,7 @@ def sinking_of_rail(facts):
     Under P it is P (4 B k^3)^(-1/4) / 2: Hetenyi (1946), as for `sag_on_foundation`.
     """
     heaviest = max((float(loads.max(initial=0.0)) for loads in facts.static_loads), default=0.0)
-    for track in layered_tracks(facts):
+    for track in _layers(facts):
         pads, ballast = float(track.pad_stiffness), float(track.ballast_stiffness)
         k = 1.0 / (1.0 / pads + 1.0 / ballast) / float(track.sleeper_spacing)
         sunk = heaviest / 2 / (4 * float(track.rail_rigidity) * k**3) ** 0.25
@@ -485,14 +485,14 @@ def sinking_of_rail(facts):
 
 def sleepers_over_rail(facts):
     """Mass of the sleepers over that of the rail."""
-    for track in layered_tracks(facts):
+    for track in _layers(facts):
         of_sleepers = float(track.sleeper_mass) / float(track.sleeper_spacing)
         yield Value("track.sleeper_mass", of_sleepers / float(track.rail_mass))
 
 
 def damping_of_sleepers(facts):
     """Damping ratio of a sleeper between its springs by either damper, unless that is 0."""
-    for track in layered_tracks(facts):
+    for track in _layers(facts):
         stiffness = float(track.pad_stiffness) + float(track.ballast_stiffness)
         critical = 2 * math.sqrt(stiffness * float(track.sleeper_mass))
         for name in ("pad_damping", "ballast_damping"):

@@ -222,7 +222,6 @@ def faulty(quantities=("deflection", "deflection"), **about) -> Log:
 
 
 LATE = (jb.MovingMass(mass=0.5, speed=1.0, entry_time=0.9),)
-SOON = (jb.MovingMass(mass=0.5, speed=2.0),)
 FORCE = (jb.MovingForce(force=5.0, speed=2.0),)
 SLOW = (jb.MovingMass(mass=0.5, speed=0.5),)
 FAULTS = {
