@@ -415,8 +415,7 @@ def test_prescribed_forces_pull_as_given_and_lose_no_contact(run, folder):
         """
     )
     printed = run("sweep pull.toml --over loads.0.speed=10,12")
-    assert "smallest contact force -10000 N" in printed
-    assert "no run loses contact, as the force is prescribed" in printed
+    assert "contact" not in printed
     printed = run("simulate pull.toml")
     assert "is negative at times, down to -1e+04 N, as given" in printed
     assert "pulls, as given" in printed and "would lift" not in printed

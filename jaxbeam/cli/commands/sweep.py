@@ -358,27 +358,29 @@ def _contact_lines(
 ) -> list[str]:
     """Smallest contact force of all runs, where it is, and how many runs lose contact.
 
-    Prescribed forces may be negative, as given: of them no contact is lost.
+    Nothing is said of prescribed forces, which neither mass nor spring can change.
     """
     import numpy as np
 
     from jaxbeam.model.load_set import load_set
 
     forces = results.get("lowest_contact_force")
-    if forces is None or not forces.size or np.isnan(forces.values).all():
+    if forces is None:
         return []
-    least = np.fmin.reduce(forces.values, axis=-1)
     prescribed = load_set(case).prescribed
     if prescribed.size != forces.shape[-1]:  # words change the number of wheels, not their kind
         prescribed = np.full(forces.shape[-1], prescribed.all())
-    pulls = np.isfinite(results["contact_lost_time"].values) & ~prescribed
+    moved = forces.values[..., ~prescribed]
+    if not moved.size or np.isnan(moved).all():
+        return []
+    least = np.fmin.reduce(moved, axis=-1)
+    pulls = np.isfinite(results["contact_lost_time"].values[..., ~prescribed])
     run, lost = _run_of_largest(-least), int(pulls.any(axis=-1).sum())
     where = []
     for address, value in zip(addresses, _swept_values(results, run, addresses), strict=True):
         words, _, unit = _head(results[address]).partition(" (")
         where.append(f"{words} {value} {unit.rstrip(')')}".rstrip())
     words = f"contact is lost in {lost} runs" if lost else "no run loses contact"
-    words += ", as the force is prescribed" if not lost and least[run] < 0 else ""
     return [f"smallest contact force {least[run]:.6g} N, at {', '.join(where)}; {words}"]
 
 
