@@ -24,7 +24,7 @@ from jaxbeam.case.controller import (
     ControlStep,
     commanded,
 )
-from jaxbeam.case.fields import NOT_NEGATIVE, choice, concrete, is_concrete, number, part
+from jaxbeam.case.fields import NOT_NEGATIVE, choice, concrete, count, is_concrete, number, part
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 NEAR = 1e-6  # of the length, distance of a sensor from its actuator
@@ -34,11 +34,13 @@ SHARED = "period", "delay", "dropout", "jitter", "resolution"  # settings of bot
 class SemiActive(AbstractController):
     """Law of semi-active dampers: the force of a `desired` law, by rates within their limits.
 
-    Each actuator that takes commands is a damper between beam and ground, and the first sensors of
-    velocity, in their order, are at these actuators. `desired` is any other controller of the same
-    case, without period and delay of its own. Under "on-off" commands jump, so that derivatives
-    leave out what changes of the times of jumps change. In continuous time the force follows the
-    velocity at once; with a `period` it is held, so that it may put in a little energy.
+    Each actuator that takes commands is a damper between beam and ground, but for the last ones, as
+    many as `active`: these exert the desired forces as they are, beside the dampers. The first
+    sensors of velocity, in their order, are at the dampers. `desired` is any other controller of
+    the same case, of all its actuators, without period and delay of its own. Under "on-off"
+    commands jump, so that derivatives leave out what changes of the times of jumps change. In
+    continuous time the force follows the velocity at once; with a `period` it is held, so that it
+    may put in a little energy.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -67,6 +69,7 @@ class SemiActive(AbstractController):
     rates: str = choice(
         "rates between the limits, or the limits alone", "clipped", "on-off", default="clipped"
     )
+    active: int = count("number of last actuators that are no dampers", minimum=0, default=0)
 
     @property
     def design_depends_on_loads(self) -> bool:
@@ -79,7 +82,9 @@ class SemiActive(AbstractController):
     def validate(self, case):
         if self.desired is None:
             return "desired is missing: give the law of the forces that the dampers should exert"
-        count, inner = len(case.driven), type(self.desired)
+        dampers, inner = len(case.driven) - self.active, type(self.desired)
+        if dampers < 1:
+            return f"active must leave a damper of the {len(case.driven)} actuators"
         if inner.open_loop or inner is SemiActive:
             return "desired must be a law of readings, neither prescribed nor semi-active itself"
         given = [name for name in SHARED if getattr(self.desired, name) is not None]
@@ -87,13 +92,13 @@ class SemiActive(AbstractController):
             return f"desired.{given[0]} is that of the damper: give it there"
         for name in ("min_damping", "max_damping"):
             shape = getattr(self, name).shape
-            if shape not in ((), (count,)):
-                return f"{name} must be one number or {count}, one a damper, not {shape[0]}"
+            if shape not in ((), (dampers,)):
+                return f"{name} must be one number or {dampers}, one a damper, not {shape[0]}"
         pair = self.min_damping, self.max_damping
         if all(map(is_concrete, pair)) and np.any(concrete(pair[0]) > concrete(pair[1])):
             return "max_damping must be at least min_damping"
         sensors = velocity_sensors(case)
-        for k, i in enumerate(commanded(case.actuators)):
+        for k, i in enumerate(commanded(case.actuators)[:dampers]):
             terms = case.actuators[i].displacement_map()
             if len(terms) != 1 or terms[0][1] != 0:
                 return f"kind needs actuators at points of the beam; actuators.{i} bends it"
@@ -116,9 +121,9 @@ class SemiActive(AbstractController):
         return self._inner().breakpoints(case)
 
     def design_law(self, plant):
-        count = len(plant.case.driven)
-        low, high = (xp.broadcast_to(one, count) for one in (self.min_damping, self.max_damping))
-        sensors = velocity_sensors(plant.case)[:count]
+        dampers = len(plant.case.driven) - self.active
+        low, high = (xp.broadcast_to(one, dampers) for one in (self.min_damping, self.max_damping))
+        sensors = velocity_sensors(plant.case)[:dampers]
         return SemiActiveLaw(self._inner().law(plant), low, high, sensors, self.rates == "on-off")
 
     def _inner(self) -> AbstractController:
@@ -135,8 +140,8 @@ class SemiActiveLaw(AbstractSampledLaw, AbstractContinuousLaw):
     """Desired law, rates (N s/m) between which its force is kept, and sensors of the velocities."""
 
     desired: Any
-    min_damping: Float[Array, " actuator"]
-    max_damping: Float[Array, " actuator"]
+    min_damping: Float[Array, " damper"]
+    max_damping: Float[Array, " damper"]
     sensors: tuple[int, ...] = eqx.field(static=True)
     on_off: bool = eqx.field(static=True)
 
@@ -165,9 +170,12 @@ class SemiActiveLaw(AbstractSampledLaw, AbstractContinuousLaw):
         return self.desired.rates(state, measurement, command, t)
 
     def _given(self, desired, measurement):
-        """Forces (N) of the dampers for desired forces, by rates within their limits."""
+        """Commands for desired ones: those of the dampers by rates within their limits."""
+        desired, others = xp.split(desired, [len(self.sensors)])
         velocity = measurement.readings[np.array(self.sensors)]
         most, least = -self.max_damping * velocity, -self.min_damping * velocity
         if self.on_off:
-            return xp.where(desired * velocity < 0, most, least)
-        return xp.clip(desired, xp.minimum(most, least), xp.maximum(most, least))
+            forces = xp.where(desired * velocity < 0, most, least)
+        else:
+            forces = xp.clip(desired, xp.minimum(most, least), xp.maximum(most, least))
+        return xp.concatenate([forces, others])

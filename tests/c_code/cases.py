@@ -242,6 +242,12 @@ CASES = {
             period=PERIOD,
         )
     ),
+    "semi-active beside active": rig(
+        jb.SemiActive(
+            0.5, 20.0, OutputFeedback([[-6.0, -5.0], [-7.0, -4.0]]), active=1, period=PERIOD
+        ),
+        sensors=[jb.Sensor(0.2, "velocity"), jb.Sensor(0.45, "velocity")],
+    ),
     "semi-active": rig(
         jb.SemiActive(
             [0.5, 0.8], 20.0, OutputFeedback([[-6.0, -5.0], [-7.0, -4.0]]), period=PERIOD

@@ -12,6 +12,7 @@ from jaxbeam.analysis.compare import compare
 
 L, EI, MASS, DAMPING, FORCE, SPEED = 20.0, 6e9, 9e3, 0.01, 3e5, 30.0
 DAMPER, LEAST, MOST = 8.0, 2e4, 6e5
+ACTIVE, ACTIVE_GAIN = 13.0, 4e6  # m, N/m
 CASE = jb.Case(
     jb.Beam(L, EI, MASS, damping_ratio=DAMPING, modes=2),
     actuators=[jb.PointForce(DAMPER)],
@@ -31,14 +32,15 @@ def record_of(controller, **settings):
     return jb.simulate(dataclasses.replace(CASE, controller=controller), **settings)
 
 
-def modal_solution(damper_force, times):
+def modal_solution(damper_force, times, active_force=lambda deflection: 0.0):
     """Times, and deflections at the damper from q_j'' + 2 zeta w q_j' + w^2 q_j = f_j / (m L / 2).
 
+    An `active_force` of the deflection at another place, ACTIVE, acts there.
     The integration ends, and starts again, wherever deflection or velocity there is zero.
     """
     number = np.arange(1, 3)
     omega = (number * np.pi / L) ** 2 * np.sqrt(EI / MASS)
-    at = np.sin(number * np.pi * DAMPER / L)
+    at, other = (np.sin(number * np.pi * place / L) for place in (DAMPER, ACTIVE))
 
     def motion(state):
         return at @ state[:2], at @ state[2:]
@@ -46,6 +48,7 @@ def modal_solution(damper_force, times):
     def rates(t, state):
         x = SPEED * t
         load = -FORCE * np.sin(number * np.pi * x / L) * (x <= L)
+        load = load + other * active_force(other @ state[:2])
         push = (load + at * damper_force(*motion(state))) / (MASS * L / 2)
         return [*state[2:], *(push - 2 * DAMPING * omega * state[2:] - omega**2 * state[:2])]
 
@@ -69,16 +72,29 @@ def modal_solution(damper_force, times):
     return np.array(found).T
 
 
+@pytest.mark.parametrize("active", [False, True])
 @pytest.mark.parametrize(("rates", "tolerance"), [("clipped", 2e-6), ("on-off", 2e-4)])
-def test_switching_damper_against_scipy(rates, tolerance):
+def test_switching_damper_against_scipy(rates, tolerance, active):
+    """Alone, and beside an active force against the deflection elsewhere."""
+
     def force(deflection, velocity):
         desired = -GAIN * deflection
         if rates == "on-off":
             return -(MOST if desired * velocity < 0 else LEAST) * velocity
         return np.clip(desired, *sorted((-LEAST * velocity, -MOST * velocity)))
 
-    record = record_of(semi_active(rates=rates), tolerance=1e-4)
-    times, expected = modal_solution(force, record.times)
+    case, law = CASE, semi_active(rates=rates)
+    gain = ACTIVE_GAIN if active else 0.0
+    if active:
+        case = dataclasses.replace(
+            CASE,
+            actuators=[jb.PointForce(DAMPER), jb.PointForce(ACTIVE)],
+            sensors=[*CASE.sensors, jb.Sensor(ACTIVE)],
+        )
+        rows = [[-GAIN, 0.0, 0.0], [0.0, 0.0, -gain]]
+        law = semi_active(desired=jb.OutputFeedback(rows), rates=rates, active=1)
+    record = jb.simulate(dataclasses.replace(case, controller=law), tolerance=1e-4)
+    times, expected = modal_solution(force, record.times, lambda deflection: -gain * deflection)
     assert times.size > record.times.size - 20  # those at which a piece starts are left out
     deflection = np.asarray(record.deflection[np.isin(record.times, times), 0])
     assert_allclose(deflection, expected, atol=tolerance * np.abs(expected).max())
@@ -121,6 +137,7 @@ def test_least_peak_bounds_passive_semi_active_and_active():
         (jb.SemiActive(1.0, 2.0), None, "controller.desired is missing"),
         (semi_active(desired=jb.Feedback([1.0], period=0.1)), None, "desired.period is that of"),
         (jb.SemiActive(2.0, 1.0, jb.Feedback([1.0])), None, "max_damping must be at least min"),
+        (semi_active(active=1), None, "active must leave a damper of the 1 actuators"),
         (semi_active(), [jb.Sensor(DAMPER)], "a sensor of velocity at each damper"),
         (semi_active(), [jb.Sensor(3.0, "velocity")], r"sensors.0 is at 3 m, actuators.0 at 8 m"),
         (semi_active(desired=jb.Feedback([1.0, 2.0])), None, r"desired\.gains must list one gain"),

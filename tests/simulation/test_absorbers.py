@@ -62,8 +62,11 @@ def test_beam_under_mass():
     assert found == pytest.approx(UNDER_MASS, rel=1e-4)
 
 
-def first_principles(case, times):
-    """Modal amplitudes and heights of bodies by scipy, from the equations with inerters."""
+def first_principles(case, times, push=lambda amplitudes, rates: 0.0):
+    """Modal amplitudes and heights of bodies by scipy, from the equations with inerters.
+
+    `push` are the forces of a law on the modes.
+    """
     beam, (load,), absorbers = case.beam, case.loads, case.absorbers
     length, modes = float(beam.length), np.arange(1, beam.modes + 1)
     omega = (modes * np.pi / length) ** 2 * np.sqrt(beam.flexural_rigidity / beam.mass_per_length)
@@ -91,6 +94,7 @@ def first_principles(case, times):
         x = float(load.speed) * t
         force = -float(load.force) * shape(x) if x < length else np.zeros(count)
         modal = force - omega**2 * q - 2 * 0.01 * omega * dq - places.T @ pull
+        modal = modal + push(q, dq)
         return np.concatenate([dq, du, inverse @ np.concatenate([modal, pull])])
 
     exit_time, start = length / float(load.speed), np.zeros(2 * (count + bodies))
@@ -147,6 +151,45 @@ def test_the_road_is_not_under_what_hangs_on_the_beam():
     level, rough = (jb.simulate(dataclasses.replace(case, profile=r)) for r in (None, road))
     assert rough.stroke == pytest.approx(level.stroke, abs=1e-12)
     assert rough.body_displacement == pytest.approx(level.body_displacement, abs=1e-12)
+
+
+def feedback_and_gain(at):
+    """Displacement feedback at a place, and its gain (N per amplitude and rate of the modes)."""
+    return jb.Feedback([4e6]), 4e6 * np.append(at, 0 * at)
+
+
+def regulator_and_gain(at):
+    """Regulator, and its gain by scipy; it is designed for the beam without the absorber."""
+    omega = (np.arange(1, 4) * np.pi / 25) ** 2 * np.sqrt(30e9 / 15e3)
+    matrix = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag(omega**2), -np.diag(0.02 * omega)]])
+    inputs, weights = np.append(0 * at, at)[:, None], np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0])
+    riccati = scipy.linalg.solve_continuous_are(matrix, inputs, np.diag(weights), [[1e-9]])
+    return jb.LQR(state_weight=weights, command_weight=[1e-9]), 1e9 * inputs[:, 0] @ riccati
+
+
+@pytest.mark.parametrize("law_and_gain", [feedback_and_gain, regulator_and_gain])
+def test_an_absorber_beside_a_law(law_and_gain):
+    at = np.sqrt(2 / (15e3 * 25)) * np.sin(np.pi * np.arange(1, 4) * 10.0 / 25)
+    law, gain = law_and_gain(at)
+    case = jb.Case(
+        dataclasses.replace(BRIDGE, modes=3),
+        actuators=[jb.PointForce(10.0)],
+        sensors=[jb.Sensor(10.0)],
+        loads=[jb.MovingForce(force=2e5, speed=30.0)],
+        absorbers=[jb.Absorber(12.5, mass=3750.0, **DEN_HARTOG, inertance=400.0)],
+        controller=law,
+        run=jb.Run(2.0, sample_rate=100.0),
+    )
+    record = jb.simulate(case, tolerance=1e-8)
+
+    def push(amplitudes, rates):
+        return -at * (gain @ np.append(amplitudes, rates))
+
+    amplitudes, heights, _ = first_principles(case, np.asarray(record.times), push)
+    expected = amplitudes @ at
+    assert record.deflection[:, 0] == pytest.approx(expected, abs=1e-7 * np.abs(expected).max())
+    largest = np.abs(heights).max()
+    assert record.body_displacement == pytest.approx(heights, abs=1e-7 * largest)
 
 
 def test_receptance_with_absorbers():
