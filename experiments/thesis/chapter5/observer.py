@@ -213,7 +213,7 @@ def _figures(loops) -> dict[str, Figure]:
         "observed-0.2ms": _draw(fast, None, "0.2 ms (Figs 5.4, 5.5, 5.7)"),
         "observed-5ms": _draw(slow, fast[1], "5 ms (Figs 5.6, 5.7)"),
         "observed-10ms": _draw(
-            moved_slow, moved_fast[1], "10 ms, shaker at 0.25 m, two modes (Figs 5.8, 5.9)"
+            moved_slow, moved_fast[1], "10 ms, shaker at 0.25 m (Figs 5.8, 5.9)"
         ),
     }
 
@@ -243,5 +243,5 @@ def _draw(loops: tuple[ObservedLoop, ...], reference: ObservedLoop | None, title
     voltage.plot(times, controlled.commands, color=colour(2), drawstyle="steps-post")
     voltage.set(ylabel="voltage (V)", xlabel="time (s)", xlim=(0, times[-1]))
     rows[0].legend(loc="lower right", ncols=3)
-    set_title(figure, f"Regulator with an observer, sampled every {title}")
+    set_title(figure, f"Regulator with an observer, every {title}")
     return figure

@@ -47,7 +47,7 @@ from experiments.thesis.verdicts import (
 )
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.plot.style import colour, set_title, use_style
+from jaxbeam.plot.style import COLOURS, colour, set_title, use_style
 
 MODE_COUNTS = (1, 2, 3, 6)
 
@@ -278,12 +278,13 @@ def _draw_interpretations(tables, ratios) -> Figure:
         printed = np.concatenate([one.numbers for one in both_speeds])
         bars = np.arange(printed.size)
         for i, (name, values) in enumerate(ratios[kind].items()):
-            axes.plot(bars, np.ravel(values), "o", markersize=4, color=colour(i), label=name)
+            marker = "od"[i // len(COLOURS)]  # colours repeat
+            axes.plot(bars, np.ravel(values), marker, markersize=4, color=colour(i), label=name)
         axes.plot(bars, printed, "_", color="k", markersize=14, label="printed")
         axes.set_xticks(bars, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
         axes.set(title=kind, xlabel="mass (kg), at 0.3 and 0.55 m/s")
     # By one interpretation the response grows without bound; the table has its peak.
-    panels[0].set(ylabel="peak (% of no control)", ylim=(0, 110))
+    panels[0].set(ylabel="peak (% of no control)", ylim=(0, 120))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=1)
     set_title(figure, "Optimal control by several interpretations (Tables 5.1 to 5.4)")
     return figure
