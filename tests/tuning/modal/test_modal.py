@@ -92,6 +92,17 @@ def test_decay_is_found_and_fitted():
     assert np.sum((fit.measured - fit.fitted) ** 2) < 0.1 * np.sum(fit.measured**2)
 
 
+def test_a_mode_that_moves_counts_however_little_it_accelerates():
+    """Its accelerations have a thousandth of the energy, its velocities a sixtieth."""
+    t, random = np.arange(2000) / 200.0, np.random.default_rng(0)
+    poles = 2 * np.pi * np.array([4.0, 16.0]) * (-0.01 + 1j)
+    decays = np.real(np.exp(np.multiply.outer(t, poles)) * [0.0158, 1.0])
+    readings = decays.sum(axis=1)[:, None] + 1e-4 * random.normal(size=(t.size, 1))
+    fit = identify_modes(make_log(readings, 200.0), window=(0.0, 10.0), band=(3.0, 20.0))
+    np.testing.assert_allclose(np.sort(fit.frequencies), [4.0, 16.0], rtol=1e-3)
+    assert min(mode.energy_share for mode in fit.modes) < 0.0015
+
+
 def test_mains_hum_is_no_mode():
     fit = identify_modes(decay(2, hum=0.2), window=(3.0, 9.0), band=BAND)
     np.testing.assert_allclose(fit.frequencies, FREQUENCIES, rtol=2e-3)

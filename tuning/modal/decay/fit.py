@@ -211,7 +211,7 @@ BandFits = list[tuple[tuple[float, float], DecayFit]]  # of parts of a band (Hz)
 def decay_candidates(
     fits: BandFits,
     decays: int,
-    channels: int,
+    derivatives: tuple[int, ...],
     duration: float,
     band: tuple[float, float],
     is_free: bool = False,
@@ -220,15 +220,18 @@ def decay_candidates(
 
     In decays that are free for sure (`is_free`) a shape may be complex, and frequency and damping
     depend on amplitude, which widens their intervals: no force makes it so.
-    Columns of the fits are the `channels` of each of several `decays`, or of combinations of these.
+    Columns of the fits are the channels of each of several `decays`, or of combinations of these;
+    `derivatives` are the orders of the channels as time derivatives. A mode is too weak only if it
+    has little of the energy of the readings and of that of velocities: the lower of two modes of
+    one velocity has less acceleration.
     """
-    found, by_decay = [], []
+    found, by_decay, channels = [], [], len(derivatives)
     collinear = 0.0 if is_free else MIN_COLLINEARITY
     for part, fit in fits:
-        total = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
         parts = fit.energies.shape[1] // channels
         columns = fit.energies.reshape(-1, parts, channels)
-        shares = np.mean(columns.sum(axis=1) / np.maximum(total, 1e-300), axis=1)
+        shares = _shares(columns, fit, duration, (1,) * channels)
+        kinetic = _shares(columns, fit, duration, derivatives)
         energies = columns.sum(axis=2)
         if parts != decays:  # combinations of decays
             energies = energies.sum(axis=1, keepdims=True)
@@ -237,17 +240,38 @@ def decay_candidates(
             changing = tuple(
                 gone and _is_near_stronger(k, fit.modes, shares) for k, gone in enumerate(fit.gone)
             )
-        for mode, share, gone, energy in zip(
-            fit.modes, shares.tolist(), changing, energies, strict=True
+        for mode, share, moved, gone, energy in zip(
+            fit.modes, shares.tolist(), kinetic.tolist(), changing, energies, strict=True
         ):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
                 mode = mode._replace(energy_share=share)
-                reason = rejection_reason(mode, duration, band, collinear) or (
+                larger = mode._replace(energy_share=max(share, moved))
+                reason = rejection_reason(larger, duration, band, collinear) or (
                     NOT_REPRODUCED if gone else ""
                 )
                 found.append(Candidate(mode, reason, 1))
                 by_decay.append(energy)
     return without_duplicates(_without_nonlinearity(found, by_decay))
+
+
+def _shares(
+    energies: Float[np.ndarray, "mode part channel"],
+    fit: DecayFit,
+    duration: float,
+    derivatives: tuple[int, ...],
+) -> Float[np.ndarray, " mode"]:
+    """Fractions of the modes in the energy of velocities, averaged over channels.
+
+    Channels are time derivatives of orders `derivatives`; as velocities themselves they keep the
+    energy of their readings.
+    """
+    power = 2.0 * (1 - np.array(derivatives))
+    spectrum = np.abs(np.fft.rfft(fit.measured, axis=0)[1:]) ** 2
+    spectrum = spectrum.reshape(len(spectrum), -1, len(derivatives)).sum(axis=1)
+    bins = np.arange(1, 1 + len(spectrum))[:, None] / duration
+    total = 2 / len(fit.measured) * np.sum(spectrum * bins**power, axis=0)
+    own = np.array([one.frequency for one in fit.modes])[:, None] ** power
+    return np.mean(own * energies.sum(axis=1) / np.maximum(total, 1e-300), axis=1)
 
 
 def _is_near_stronger(k, modes, shares) -> bool:

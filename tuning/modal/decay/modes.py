@@ -225,16 +225,16 @@ def free_decay_modes(
     ):
         return None
     cycle = samples.rate / frequency
-    one = _fitted(decays, samples, band, order)
+    one = _fitted(decays, samples, derivatives, band, order)
     if one is None:
         return None
     if all(one.from_rest for one in decays):
-        return _of_fit(_of_best_length(one, samples, band, order), samples)
+        return _of_fit(_of_best_length(one, samples, derivatives, band, order), samples)
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, excited, band, cycle)
         if rest == one.used:
             break
-        one = _fitted(rest, samples, band, order)
+        one = _fitted(rest, samples, derivatives, band, order)
         if one is None:
             return None
     else:
@@ -277,7 +277,7 @@ def _of_fit(one: _Fitted, samples: Samples):
     return one.candidates, one.diagrams, first
 
 
-def _of_best_length(whole: _Fitted, samples: Samples, band, order) -> _Fitted:
+def _of_best_length(whole: _Fitted, samples: Samples, derivatives, band, order) -> _Fitted:
     """The fit of an impact's decay, or of its first part if that has more information on modes.
 
     Unsteady noise and frequencies that depend on amplitude may make the later parts of a decay
@@ -286,11 +286,11 @@ def _of_best_length(whole: _Fitted, samples: Samples, band, order) -> _Fitted:
     length, fits = len(whole.measured), [whole]
     for fraction in SHORTER_PARTS:
         part = tuple(one._replace(stop=one.start + int(fraction * length)) for one in whole.used)
-        fits.append(_fitted(part, samples, band, order) or whole)
+        fits.append(_fitted(part, samples, derivatives, band, order) or whole)
     return max(fits, key=lambda one: information_of_modes(one.candidates))
 
 
-def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
+def _fitted(decays, samples: Samples, derivatives, band, order) -> _Fitted | None:
     """Fits of decays; None if they are too short."""
     windows, used = stacked(samples.records, decays)
     if len(windows) < MIN_SAMPLES // 2:
@@ -315,7 +315,7 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
     )
     duration = len(windows) / samples.rate
     is_free = all(one.from_rest for one in used)
-    found = decay_candidates(fits, len(used), channels, duration, band, is_free)
+    found = decay_candidates(fits, len(used), derivatives, duration, band, is_free)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
 
 
