@@ -83,14 +83,15 @@ class TranslatedLoop(NamedTuple):
 class _Program(NamedTuple):
     """C code of the events of loops of one structure: its arguments, and the parts they share.
 
-    `given` flags the `constants` and numbers of a loop that are arguments; `rest` are the parts of
-    a loop that are no numbers, `kinds` the places of its numbers, their shapes and types.
+    `given` flags the `constants` and numbers of a loop that are arguments; `rest` are the leaves of
+    a loop that are no numbers, None for these, `kinds` its structure, the flags of its numbers,
+    their shapes and types.
     """
 
     text: str
     constants: list[np.ndarray]
     given: list[bool]
-    rest: SampledLoop
+    rest: list
     kinds: list
 
 
@@ -103,14 +104,17 @@ def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
     found: list[TranslatedLoop] = []
     program = None
     for loop in loops:
-        numbers, rest = eqx.partition(loop, _is_number)
-        numbers, memory = (jax.tree.map(np.asarray, tree) for tree in (numbers, loop.start(1)))
-        (leaves, places), kept = jax.tree.flatten(numbers), jax.tree.leaves(memory)
-        kinds = [places, *((leaf.shape, leaf.dtype) for leaf in leaves)]
+        leaves, structure = jax.tree.flatten(loop)
+        flags = list(map(_is_number, leaves))
+        numbers = [np.asarray(leaf) for leaf in itertools.compress(leaves, flags)]
+        rest = [None if own else leaf for own, leaf in zip(flags, leaves, strict=True)]
+        memory = jax.tree.map(np.asarray, loop.start(1))
+        kept = jax.tree.leaves(memory)
+        kinds = [structure, flags, *((one.shape, one.dtype) for one in numbers)]
         same = program is not None and kinds == program.kinds
         if not (same and eqx.tree_equal(rest, program.rest) is True):
             program = _program(loop, numbers, rest, memory, kinds)
-        arrays = [*program.constants, *leaves]
+        arrays = [*program.constants, *numbers]
         given = itertools.compress(arrays, program.given)
         start = np.concatenate([np.ravel(leaf).astype(float) for leaf in kept])
         place = sum(np.size(leaf) for leaf in kept[:-1])  # failures are the last
@@ -119,12 +123,16 @@ def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
 
 
 def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Program:
-    """Program of a loop, from its numbers, its other parts, and its initial memory."""
+    """Program of a loop, from its numbers, its other leaves (None for numbers), and its memory."""
     if loop.measured_rows is not None:
         raise UntranslatedError("readings of accelerations")
 
+    structure, flags, *_ = kinds
+
     def process(numbers, event, time, memory, state):
-        own = eqx.combine(numbers, rest)
+        left = iter(numbers)
+        leaves = [next(left) if own else leaf for own, leaf in zip(flags, rest, strict=True)]
+        own = jax.tree.unflatten(structure, leaves)
         memory = own._process_event(memory, state, StepInfo(time, jnp.zeros(()), event))
         return own.path.acting(memory.commands), memory
 
@@ -132,7 +140,7 @@ def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Pr
     closed = jax.make_jaxpr(process)(numbers, np.int64(0), np.float64(0), memory, state)
     jaxpr = without_unused(closed.jaxpr)
     used, constants = used_variables(jaxpr), list(map(np.asarray, closed.consts))
-    arrays = [*constants, *jax.tree.leaves(numbers)]
+    arrays = [*constants, *numbers]
     given = [v in used for v, _ in zip([*jaxpr.constvars, *jaxpr.invars], arrays, strict=False)]
     shown = [array if own else None for array, own in zip(arrays, given, strict=True)]
     text = _text(jaxpr, shown, jax.tree.leaves(memory), state)
