@@ -24,7 +24,7 @@ from tuning.logs.reading import read_log, read_logs
 from tuning.modal.arguments import ModalSettings
 from tuning.modal.fit import ModalFit
 from tuning.modal.identify_modes import identify_modes
-from tuning.parameters.free import Prior
+from tuning.parameters import Prior
 from tuning.weighing.weigh import weigh
 
 MOVED = {  # names of former versions, each with the module in which it is now

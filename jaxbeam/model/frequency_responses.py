@@ -43,9 +43,8 @@ from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.model.output_rows import row_on_states, sensor_rows
 from jaxbeam.runtime.arrays import Array, Module, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.runtime.printer import TableViews
+from jaxbeam.runtime.printer import TableViews, labelled_dataset
 
 POINT_QUANTITIES = tuple(
     name for name, entry in QUANTITIES.items() if not (entry.at_fibre or entry.over_modulus)

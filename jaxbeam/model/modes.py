@@ -53,8 +53,7 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
-from jaxbeam.runtime.dataset import labelled_dataset
-from jaxbeam.runtime.printer import TableViews
+from jaxbeam.runtime.printer import TableViews, labelled_dataset
 
 FURTHER_POINTS = 8  # of the quadrature, for properties of degree up to 15
 

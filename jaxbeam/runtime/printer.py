@@ -1,4 +1,4 @@
-"""Tables: as text at any width, in HTML and Markdown, and the views of results that have columns.
+"""Tables: as text, in HTML and Markdown; views of results with columns; labelled datasets.
 
 Nothing heavy is imported at the top, so that the command line may use it.
 """
@@ -8,13 +8,14 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy
     import pandas  # imported where it is used, as it takes half a second
+    import xarray
 
 Row = Sequence[str]
 NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -196,3 +197,38 @@ def _cell(entry: Any) -> str:
     if isinstance(entry, str):
         return entry
     return "" if entry != entry else f"{entry:.6g}"
+
+
+def labelled_dataset(
+    variables: Mapping[str, tuple],
+    coordinates: Mapping[str, tuple],
+    attributes: Mapping[str, Any] | None = None,
+) -> "xarray.Dataset":
+    """`xarray.Dataset` of tuples (dimensions, array, attributes), the last of which may be missing.
+
+    The same dataset sooner: told that arrays are NumPy's, xarray does not import dask and pint,
+    half a second, to see whether they are theirs.
+    """
+    import numpy as np
+    import pandas
+    import xarray
+
+    def variable(dimensions, values, attributes=None):
+        dimensions = (dimensions,) if isinstance(dimensions, str) else tuple(dimensions)
+        return xarray.Variable(dimensions, np.asarray(values), attributes, fastpath=True)
+
+    own = {name: variable(*given) for name, given in coordinates.items()}
+    indexes = {
+        name: xarray.indexes.PandasIndex(
+            pandas.Index(one.data, dtype=object if one.dtype == object else None), name, one.dtype
+        )
+        for name, one in own.items()
+        if one.dims == (name,)
+    }
+    for name, index in indexes.items():
+        own |= index.create_variables({name: own[name]})
+    return xarray.Dataset(
+        {name: variable(*given) for name, given in variables.items()},
+        xarray.Coordinates(own, indexes),
+        attributes,
+    )

@@ -23,8 +23,7 @@ from jaxbeam.model.sensor_signals import (
 )
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, Module, any_traced, set_at, take, to_numpy, xp
-from jaxbeam.runtime.dataset import labelled_dataset
-from jaxbeam.runtime.printer import TableViews
+from jaxbeam.runtime.printer import TableViews, labelled_dataset
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.errors import Extremes, chosen_samples, truncation_errors
 from jaxbeam.simulation.labels import Flights, contact_sentence, flights_sentence

@@ -24,9 +24,8 @@ from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array, Module, any_traced
-from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.runtime.printer import TableViews, html_table, text_table
+from jaxbeam.runtime.printer import TableViews, html_table, labelled_dataset, text_table
 from jaxbeam.simulation.errors import Extremes
 from jaxbeam.simulation.labels import (
     ACTING_COMMAND,

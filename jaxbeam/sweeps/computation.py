@@ -18,8 +18,8 @@ from jaxbeam.case.case import Case, address_words, unit_at
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse
-from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.memory import rare_collections, size_text
+from jaxbeam.runtime.printer import labelled_dataset
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.labels import SWEEP_VARIABLES, sensor_coordinates

@@ -31,8 +31,8 @@ import numpy as np
 
 from jaxbeam.files.netcdf import check_codecs
 from jaxbeam.runtime.arrays import collapse
-from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.output_file import naming_file, writer_lock
+from jaxbeam.runtime.printer import labelled_dataset
 
 if TYPE_CHECKING:
     import xarray

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import xarray
 
-from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.printer import labelled_dataset
 
 VARIABLES = {
     "peak": (("speed", "sensor"), np.arange(6.0).reshape(3, 2), {"units": "m"}),
@@ -41,7 +41,7 @@ def test_the_dataset_is_that_of_xarray():
 
 def test_no_package_of_other_arrays_is_imported():
     program = (
-        "import sys; from jaxbeam.runtime.dataset import labelled_dataset;"
+        "import sys; from jaxbeam.runtime.printer import labelled_dataset;"
         "labelled_dataset({'a': ('x', [1.0])}, {'x': ('x', [2.0]), 'name': ('x', ['b'])});"
         "assert not {'dask', 'pint', 'cupy', 'sparse'} & set(sys.modules)"
     )

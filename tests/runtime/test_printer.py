@@ -19,7 +19,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import html_table, terminal_width, text_table
 from tests.modules import DATA, ROOT
 from tuning.control.tuning_result import RunSetResult
-from tuning.parameters.free import FreeParameter
+from tuning.parameters import FreeParameter
 
 WORDS = strategies.text("abcdef", min_size=1, max_size=12)
 CELLS = strategies.lists(WORDS, max_size=5).map(" ".join)

@@ -17,7 +17,7 @@ from tuning import Fit, Log
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares, t_quantile
 from tuning.fit.result import fit_result
-from tuning.parameters.free import free_parameters, to_unbounded
+from tuning.parameters import free_parameters, to_unbounded
 
 RATE, MEMORY = 100.0, 0.5  # Hz, correlation from sample to sample
 NOISE = {"deflection": 1e-5, "acceleration": 2e-3}  # m, m/s^2

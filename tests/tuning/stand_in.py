@@ -10,8 +10,7 @@ from tuning import Log
 from tuning.fit.dataset import Dataset
 from tuning.fit.least_squares import LeastSquares
 from tuning.fit.result import fit_result
-from tuning.parameters.free import free_parameters
-from tuning.parameters.prediction import FunctionPrediction
+from tuning.parameters import FunctionPrediction, free_parameters
 
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
 AMPLITUDES = (1.0, 1.6, 0.7)  # initial deflection (m) in each log

@@ -29,7 +29,7 @@ from tuning.control.penalised_objective import (
     values_and_gradients,
 )
 from tuning.control.run_set import RunSet
-from tuning.parameters.free import FreeParameter, to_unbounded
+from tuning.parameters import FreeParameter, to_unbounded
 
 METHODS = ("adam", "lbfgs", "bfgs")
 ADAM_STEP = 0.1  # first step of Adam, in search variables, which are of order one

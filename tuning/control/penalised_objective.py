@@ -17,7 +17,7 @@ from jaxbeam.runtime.compiling import compiled
 from tuning.control.load_cases import AddressValues, run_cases
 from tuning.control.objective import Objective, WeightsAndLimits, with_fixed_design
 from tuning.control.run_set import RunSet
-from tuning.parameters.free import FreeParameter
+from tuning.parameters import FreeParameter
 
 STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violation
 

@@ -27,7 +27,7 @@ from tuning.control.run_set import RunSet, draw_plants, make_run_set, with_ident
 from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty import Posterior
-from tuning.parameters.free import free_parameters
+from tuning.parameters import free_parameters
 
 ParameterBounds = Mapping[str, tuple[float, float] | None]
 

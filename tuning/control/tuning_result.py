@@ -23,7 +23,7 @@ from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case, value_columns
 from tuning.control.objective import Objective, with_fixed_design
-from tuning.parameters.free import FreeParameter
+from tuning.parameters import FreeParameter
 
 LIMIT_TOLERANCE = 0.01  # fraction of a limit by which it may be exceeded without a remark
 

@@ -17,8 +17,7 @@ from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, in
 from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
-from tuning.parameters.free import with_values
-from tuning.parameters.prediction import LogPrediction
+from tuning.parameters import LogPrediction, with_values
 
 SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution of logs
 

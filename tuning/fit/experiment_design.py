@@ -21,7 +21,7 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.simulate import simulate_readings
 from tuning.fit.dataset import SIMULATION_TOLERANCE
-from tuning.parameters.free import check_continuous
+from tuning.parameters import check_continuous
 
 START_COUNT = 5  # of the search, as there may be several local minima
 

@@ -22,8 +22,7 @@ from jaxbeam.model.modes import mesh_layout
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, confidence_intervals
 from tuning.fit.result import parameter_table
 from tuning.logs.log import Log
-from tuning.parameters.free import FreeParameter, Prior, free_parameters
-from tuning.parameters.prediction import FunctionPrediction
+from tuning.parameters import FreeParameter, FunctionPrediction, Prior, free_parameters
 
 MIN_RELATIVE_SD = 1e-3  # of a measured response; no sensor is better calibrated
 

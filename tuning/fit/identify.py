@@ -18,7 +18,7 @@ from tuning.fit.dataset import Dataset, make_dataset
 from tuning.fit.least_squares import LeastSquares, SearchPoint, check_loss, multi_start
 from tuning.fit.result import Fit, fit_result
 from tuning.logs.log import Log
-from tuning.parameters.free import LOG_ADDRESS, FreeParameter, Prior, free_parameters
+from tuning.parameters import LOG_ADDRESS, FreeParameter, Prior, free_parameters
 
 
 @refuses_traced("a fit")

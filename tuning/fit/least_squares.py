@@ -20,8 +20,7 @@ from scipy.stats import norm, qmc, t as student
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.progress import found_so_far
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint
-from tuning.parameters.free import FreeParameter, to_unbounded
-from tuning.parameters.prediction import SamplePrediction
+from tuning.parameters import FreeParameter, SamplePrediction, to_unbounded
 
 # All but LEAST_PARTICIPATION are in typical sizes of the parameters.
 UNIDENTIFIABLE_SD = 0.5  # standard error beyond which a direction counts as unidentifiable

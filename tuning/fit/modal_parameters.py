@@ -23,7 +23,7 @@ from jaxbeam.model.modes import mesh_layout, modes
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH, t_quantile, uncertainty
 from tuning.fit.result import parameter_table
 from tuning.modal.result import ModalEstimates, mac_matrix
-from tuning.parameters.free import FreeParameter, Prior, free_parameters, to_unbounded
+from tuning.parameters import FreeParameter, Prior, free_parameters, to_unbounded
 
 MIN_RELATIVE_FREQUENCY_SD = 1e-4  # of a frequency; clocks and temperature allow no better
 MIN_RELATIVE_DAMPING_SD = 1e-2

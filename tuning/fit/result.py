@@ -37,7 +37,7 @@ from tuning.fit.least_squares import (
 )
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, samples_held
-from tuning.parameters.free import LOG_ADDRESS, FreeParameter, Prior, to_unbounded, with_values
+from tuning.parameters import LOG_ADDRESS, FreeParameter, Prior, to_unbounded, with_values
 
 MAX_CORRELATION = 0.95  # correlation beyond which two parameters are called hard to tell apart
 PRIOR_DOMINANCE = 0.7  # of the prior's deviation: with a larger error the logs say less than it

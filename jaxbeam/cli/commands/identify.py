@@ -191,7 +191,7 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
 
 def _priors(bounds, normals, scales) -> dict:
     """Priors by address. Raises ValueError, naming the address, for one that is impossible."""
-    from tuning.parameters.free import Prior
+    from tuning.parameters import Prior
 
     priors = {}
     for address, pair in bounds.items():

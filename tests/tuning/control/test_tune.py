@@ -19,7 +19,7 @@ from tuning.control.load_cases import run_case
 from tuning.control.objective import Objective
 from tuning.control.optimisation import Optimisation
 from tuning.control.run_set import make_run_set
-from tuning.parameters.free import free_parameters
+from tuning.parameters import free_parameters
 
 GAIN = "controller.gains.0"
 RUNS = tuning.full_grid({"loads.0.mass": [0.3, 0.5], "loads.0.speed": [1.5]})

@@ -12,7 +12,7 @@ from tests.tuning import stand_in
 from tests.tuning.fit import test_frequency_responses
 from tuning.fit.experiment_design import ExperimentDesign
 from tuning.fit.model_validation import HeldOutPrediction
-from tuning.parameters.free import Prior
+from tuning.parameters import Prior
 
 __all__ = ["call"]
 

@@ -32,7 +32,7 @@ from tests.tuning.finite_element_rigs import (
 from tuning import Fit, Log, identify
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares, t_quantile
-from tuning.parameters.free import free_parameters, to_unbounded
+from tuning.parameters import free_parameters, to_unbounded
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 RATE = 500.0

@@ -32,7 +32,7 @@ from tuning.fit.least_squares import (
     robust_slope,
     variance_factor,
 )
-from tuning.parameters.free import FreeParameter, Prior, free_parameters
+from tuning.parameters import FreeParameter, Prior, free_parameters
 
 ADDRESSES = list(TRUTH)
 VALUES = np.array(list(TRUTH.values()))

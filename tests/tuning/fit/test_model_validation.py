@@ -42,7 +42,7 @@ from tuning.fit.uncertainty import (
     sample,
     with_diagnostics,
 )
-from tuning.parameters.free import Prior, to_unbounded
+from tuning.parameters import Prior, to_unbounded
 
 VALUES = np.array(list(TRUTH.values()))
 NAMES = ["sensor 0"]

@@ -13,8 +13,13 @@ from jaxbeam.runtime.compile_cache import program_name
 from jaxbeam.runtime.compiling import _partition, _signature
 from tuning import Log
 from tuning.fit.dataset import make_dataset
-from tuning.parameters.free import FreeParameter, free_parameters, with_values
-from tuning.parameters.prediction import LogPrediction, readings_with_slopes
+from tuning.parameters import (
+    FreeParameter,
+    LogPrediction,
+    free_parameters,
+    readings_with_slopes,
+    with_values,
+)
 
 CASE = jb.Case(
     beam=jb.Beam(length=1.0, flexural_rigidity=20.0, mass_per_length=2.0, damping_ratio=[0.01] * 3,

@@ -22,7 +22,7 @@ from tuning.fit.least_squares import (
     uncertainty,
 )
 from tuning.fit.result import fit_result
-from tuning.parameters.free import free_parameters
+from tuning.parameters import free_parameters
 
 NAMES = ["a", "b", "c"]
 

@@ -17,7 +17,7 @@ from tuning import Log, load_fit, save_fit
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares, t_quantile
 from tuning.fit.result import fit_result
-from tuning.parameters.free import free_parameters
+from tuning.parameters import free_parameters
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 20.0, 1e10, 8000.0, 0.02
 SPEED, START, RATE, DURATION = 15.0, -9.0, 100.0, 2.0

@@ -1,1 +1,0 @@
-"""Free parameters: addresses, bounds, scales and priors."""
