@@ -8,6 +8,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize_scalar
 
 import jaxbeam as jb
+from jaxbeam.cli.commands.sweep import _absorber_lines
+from jaxbeam.files.tables import sweep_columns
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps.quality import StrokeWarning
 from tests.simulation.test_absorbers import BRIDGE, first_principles
@@ -130,3 +132,16 @@ def test_strokes_above_the_largest_allowed_are_warned_of():
         jb.sweep(case, {"loads.0.speed": [28.0, 35.0]}, progress=False)
     with pytest.warns(StrokeWarning, match="absorber 0 exceeds its max_stroke in 1 of 2 runs"):
         jb.sweep(case, {"absorbers.*.max_stroke": [1e-4, 1.0]}, progress=False)
+
+
+def test_tables_have_strokes_and_forces():
+    case = case_under(jb.MovingMass(mass=6e3, speed=35.0))
+    runs = jb.sweep(case, {"loads.0.speed": [28.0, 35.0]}, progress=False)
+    columns = sweep_columns(runs)
+    for words, name in (("stroke (m)", "peak_stroke"), ("force (N)", "peak_absorber_force")):
+        found = columns[f"absorber 2 peak {words}"]
+        np.testing.assert_array_equal(found, runs[name].values[:, 2])
+    lines = _absorber_lines(runs, ["loads.0.speed"])
+    largest = runs.peak_absorber_force.values[:, 2]
+    speed = [28, 35][int(np.argmax(largest))]
+    assert lines[-1].split() == ["2", "force", "(N)", f"{largest.max():.6g}", f"{speed}"]
