@@ -305,3 +305,27 @@ def test_the_side_of_a_break_beside_another(near, expected):
     breaks, values = np.array([0.0, 0.5, 0.5 + 5e-9, 1.0]), np.array([1.0, 2.0, 3.0])
     influence = LoadInfluence(breaks, values[:, None, None])
     assert_allclose(influence.of_forces_at(np.array(0.5), np.array(near)), [expected])
+
+
+@pytest.mark.parametrize("quantity", ["moment", "shear", "strain", "stress"])
+def test_a_patch_at_the_right_end_is_that_at_the_left_one_mirrored(quantity):
+    """At both ends and at its inner end; the section there is that with the patch."""
+
+    def peaks(mirror: bool):
+        def place(x):
+            return 1.0 - x if mirror else x
+
+        start, end = sorted((place(0.7), place(1.0)))
+        sizes = {"fibre_distance": 0.01} if quantity == "strain" else {}
+        sizes |= {"section_modulus": 1e-6} if quantity == "stress" else {}
+        case = jb.Case(
+            jb.Beam(1.0, 12.0, 0.8, ends="clamped-clamped", damping_ratio=0.01, modes=6),
+            actuators=[jb.Patch(start, end, 1.0, added_mass=0.2, added_rigidity=4.0)],
+            sensors=[jb.Sensor(place(x), quantity, **sizes) for x in (1.0, 0.85, 0.5, 0.0)],
+            loads=[jb.MovingForce(force=5.0, speed=-2.0 if mirror else 2.0)],
+            run=jb.Run(0.6),
+        )
+        record = jb.simulate(case)
+        return np.maximum(np.abs(record.smallest), np.abs(record.largest))
+
+    np.testing.assert_allclose(peaks(True), peaks(False), rtol=1e-6)
