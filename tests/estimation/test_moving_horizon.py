@@ -64,9 +64,14 @@ def estimates(estimator, case=CASE, layout=None, readings=None, commands=None):
     return found
 
 
-def test_without_bounds_that_matter_it_is_the_kalman_filter():
-    pairs = zip(estimates(moving_horizon(**WIDE)), estimates(ESTIMATED), strict=True)
-    for found, expected in pairs:
+@pytest.mark.parametrize("actuator", [CASE.actuators[0], jb.PointForce(0.4)])
+def test_without_bounds_that_matter_it_is_the_kalman_filter(actuator):
+    """Accelerations answer to the command of a force at once, to that of a shaker later."""
+    case = dataclasses.replace(CASE, actuators=(actuator,))
+    assert np.any(jb.state_space(case).unloaded.D) == isinstance(actuator, jb.PointForce)
+    for found, expected in zip(
+        estimates(moving_horizon(**WIDE), case), estimates(ESTIMATED, case), strict=True
+    ):
         scale = np.max(np.abs(expected.state))
         assert_allclose(found.state, expected.state, rtol=1e-9, atol=1e-9 * scale)
         assert_allclose(found.weights, expected.weights, rtol=1e-9)
