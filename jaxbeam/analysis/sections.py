@@ -1,7 +1,7 @@
 """Quantities along the beam: envelopes, amplification, section forces; corrections of records.
 
-With an inner loop the amplifier of a shaker sets the voltage of its coil, which nothing bounds in
-the model; here it can be compared with what the amplifier has.
+With an inner loop the amplifier of a shaker sets the voltage of its coil; without `limits` nothing
+bounds it in the model, and here it can be compared with what the amplifier has.
 """
 
 import dataclasses
@@ -122,7 +122,10 @@ def coil_history(
     current = history(port.current)
     suspension = xp.stack([device.stiffness, device.damping, device.mass])
     force = device.force_constant * current - at_port @ suspension
-    return CoilHistory(times, current, history(port.voltage), force)
+    voltage = history(port.voltage)
+    if device.limits is not None:
+        voltage = xp.clip(voltage, *device.limits)
+    return CoilHistory(times, current, voltage, force)
 
 
 __all__ = [

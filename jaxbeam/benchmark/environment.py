@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.benchmark.problem import LOAD_STREAM, BenchmarkProblem
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -36,7 +37,7 @@ from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan
 TOLERANCE = 1e-9  # of the steps, relative to the largest deflection
 REFUSED = (
     "an environment takes a controller with a period, without dropout and jitter, and sensors"
-    " without these that measure no acceleration: {} does not fit"
+    " without these that measure no acceleration, and no limits within inner loops: {} does not fit"
 )
 
 
@@ -305,6 +306,8 @@ def _check(case: Case) -> None:
     controller = case.controller
     if controller is None or controller.period is None:
         raise ValueError(REFUSED.format("controller"))
+    for i in limited_loops(case.actuators):
+        raise ValueError(REFUSED.format(f"actuators.{i}.limits"))
     parts = {"controller": controller} | {f"sensors.{i}": s for i, s in enumerate(case.sensors)}
     for address, part in parts.items():
         if part.dropout is not None or part.jitter is not None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support, has
 from jaxbeam.case.case import Case, list_sizes, parts
 from jaxbeam.case.contact import ONE_RUN, AbstractContact
@@ -65,6 +66,12 @@ def check_case(case: Case) -> None:
         _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
         _check_controller(case)
+    elif limited := limited_loops(case.actuators):
+        raise ValueError(
+            f"actuators.{limited[0]}.limits bound the voltage of its inner loop in runs under a"
+            " controller only: give one, as kind prescribed with offsets of 0 for none, or leave"
+            " the limits out"
+        )
 
 
 def check_plant(case: Case) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
@@ -36,8 +37,9 @@ class BeamSteps:
     split where wheels enter and leave the beam, and go by Magnus' method of order 4 in between;
     readings are those of ideal sensors, in SI units. The controller of the case is left out.
 
-    Raises ValueError for an invalid case, for actuators with hysteresis or creep, and for rigid
-    wheels over kinks, whose impulses only `simulate` has.
+    Raises ValueError for an invalid case, for actuators with hysteresis, creep or limits of the
+    voltage within an inner loop, and for rigid wheels over kinks, whose impulses only `simulate`
+    has.
 
     >>> import jaxbeam as jb
     >>> from jaxbeam.fmi import BeamSteps
@@ -55,6 +57,11 @@ class BeamSteps:
 
     def __init__(self, case: Case):
         check_case(case)
+        if limited := limited_loops(case.actuators):
+            raise ValueError(
+                f"actuators.{limited[0]}.limits bound the voltage within its inner loop, and an"
+                " exported beam is linear: leave them out"
+            )
         case = concrete_case(dataclasses.replace(case, controller=None))
         for i, actuator in enumerate(case.actuators):
             if actuator.hysteresis is not None or actuator.creep is not None:

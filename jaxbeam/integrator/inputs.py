@@ -25,16 +25,18 @@ class StepInfo(NamedTuple):
 class AbstractInputPolicy(Module):
     """Commands to the actuators of a run as a function of the state.
 
-    With `implicit`, commands depend on the states at the Gauss nodes of the step. With
-    `holds_commands`, commands and memory change only at events of the schedule. `load_amplitude`
+    With `implicit`, commands depend on the states at the Gauss nodes of the step. `load_amplitude`
     is the least amplitude at which growth counts as divergence (see `growth`), infinite for
     commands that do not depend on the state.
     """
 
-    holds_commands: ClassVar[bool] = False
-
     implicit: eqx.AbstractVar[bool]
     load_amplitude: eqx.AbstractVar[Float[Array, "*batch"]]
+
+    @property
+    def holds_commands(self) -> bool:
+        """Whether commands and memory change only at events of the schedule."""
+        return False
 
     @abc.abstractmethod
     def start(self, batch_size: int) -> Any:
@@ -63,8 +65,11 @@ class HeldCommands(AbstractInputPolicy):
     model: ModalModel
     commands: Float[Array, "event command batch"]
     load_amplitude: Float[Array, " batch"]
-    holds_commands: ClassVar[bool] = True
     implicit: ClassVar[bool] = False
+
+    @property
+    def holds_commands(self):
+        return True
 
     def start(self, batch_size):
         return xp.zeros(self.commands.shape[1:])

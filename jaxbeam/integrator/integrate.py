@@ -106,15 +106,18 @@ def _advance_traced(policy, maps, infos, state, memory):
         return after, sources, observed
     # Blocks of equal length use one program; the last is filled up by repetitions of its step.
     count, found, carry = len(infos.start), [], start
-    index = np.minimum(np.arange(-(-count // BLOCK_STEPS) * BLOCK_STEPS), count - 1)
+    index = np.arange(-(-count // BLOCK_STEPS) * BLOCK_STEPS)
     for block in index.reshape(-1, BLOCK_STEPS):
-        own = jax.tree.map(lambda part, block=block: part[block], steps)
-        carry, (sources, _) = _scan_block(policy, own, carry)
-        found.append(np.asarray(sources))
-    sources, (state, memory) = np.concatenate(found), carry
+        own = np.minimum(block, count - 1)
+        maps, info = jax.tree.map(lambda part, own=own: part[own], steps)
+        info = info._replace(event=np.where(block < count, info.event, -1))
+        carry, after = _scan_block(policy, (maps, info), carry)
+        found.append(jax.tree.map(np.asarray, after))
+    sources, observed = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    state, memory = jax.tree.map(np.asarray, carry)
     if count < len(sources):
         state = sources[count, :, : state.shape[0]].T
-    return (np.asarray(state), np.asarray(memory)), sources[:count], None
+    return (state, memory), sources[:count], jax.tree.map(lambda part: part[:count], observed)
 
 
 def _scan_steps(policy, steps, start):

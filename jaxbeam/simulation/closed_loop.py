@@ -9,7 +9,7 @@ method together with the states there.
 import contextlib
 import dataclasses
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -60,6 +60,7 @@ from jaxbeam.runtime.arrays import (
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.commands import CommandMemory, CommandPath, command_path, limit_commands
+from jaxbeam.simulation.voltage_limits import VoltageLimits, with_missing_voltages
 
 SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
@@ -69,8 +70,9 @@ class ContinuousLoop(AbstractInputPolicy):
     """Input policy of a law in continuous time; its memory holds the commands at the last node.
 
     The model includes the analogue filters of sensors and law; its last states are the
-    `controller_states` of the law, and their rates the last of its commands. `implicit` is False
-    for open-loop commands, which do not depend on the state.
+    `controller_states` of the law, and their rates the last of its commands, before the voltages
+    missing to those of inner loops if `voltages` have limits. `implicit` is False for open-loop
+    commands, which do not depend on the state.
     """
 
     plant: Plant
@@ -80,6 +82,7 @@ class ContinuousLoop(AbstractInputPolicy):
     load_amplitude: Float[Array, " batch"]
     implicit: bool = eqx.field(static=True)
     controller_states: int = eqx.field(static=True)
+    voltages: VoltageLimits | None = None
 
     def start(self, batch_size):
         return xp.zeros((self.model.command_matrix.shape[1], batch_size))
@@ -95,7 +98,12 @@ class ContinuousLoop(AbstractInputPolicy):
 
         def commands_for(commands):
             of_batch = vmap(self._commands, in_axes=(-1, None), out_axes=-1)
-            return vmap(of_batch)(states(commands), times)
+            found = vmap(of_batch)(states(commands), times)
+            if self.voltages is None:
+                return found
+            others = found.shape[1] - self.voltages.low.shape[0]
+            missing = self.voltages.missing(found[:, others:])
+            return xp.concatenate([found[:, :others], missing], axis=1)
 
         guess = xp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
         commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
@@ -111,7 +119,7 @@ class ContinuousLoop(AbstractInputPolicy):
     def commands_at(
         self, states: Float[Array, "time state"], times: Float[Array, " time"]
     ) -> Float[Array, "time command"]:
-        """Commands of a single run at some times (s): those to the actuators, then the rates."""
+        """Commands of a single run at some times (s): those to the actuators, then the others."""
         if not self.implicit:
             return self._open_loop_commands(times)
         if not any_jax(self, states, times):
@@ -129,7 +137,7 @@ class ContinuousLoop(AbstractInputPolicy):
         return limit_commands(self.plant.case, commands.T).T
 
     def _commands(self, state, time):
-        """Commands and rates of the law's states, (command,), for the state of a run."""
+        """Commands, rates of the law's states and voltages asked for, for the state of a run."""
         state = state[: self.model.state_count]  # without those of vehicles
         case, outputs = self.plant.case, self.output_rows @ state
         sensors = len(case.sensors)
@@ -142,7 +150,9 @@ class ContinuousLoop(AbstractInputPolicy):
         measurement = Measurement(outputs, plant_state, xp.zeros(len(case.actuators)))
         command = limit_commands(case, self.law.command(law_state, measurement, time))
         rates = self.law.rates(law_state, measurement, command, time)
-        return xp.concatenate([command, rates])
+        if self.voltages is None:
+            return xp.concatenate([command, rates])
+        return xp.concatenate([command, rates, self.voltages.asked(state, command)])
 
 
 def newton_fixed_point(
@@ -185,7 +195,8 @@ class SampledLoop(AbstractInputPolicy):
 
     The model includes the analogue filters of the sensors; `filter_sections` are those of the
     digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
-    the forces too; None without accelerations. `path` is the way of the commands.
+    the forces too; None without accelerations. `path` is the way of the commands. With limits of
+    `voltages` the last commands are the voltages missing at the Gauss nodes of each step.
     """
 
     plant: Plant
@@ -199,8 +210,12 @@ class SampledLoop(AbstractInputPolicy):
     filter_sections: tuple
     path: CommandPath
     noise: Float[Array, "sample sensor"] | None
+    voltages: VoltageLimits | None = None
     implicit: bool = eqx.field(static=True, default=False)
-    holds_commands: ClassVar[bool] = True
+
+    @property
+    def holds_commands(self):
+        return self.voltages is None
 
     def start(self, batch_size):
         sensors, zero = self.plant.case.sensors, xp.zeros(batch_size)
@@ -227,7 +242,18 @@ class SampledLoop(AbstractInputPolicy):
             memory,
         )
         acting = self.path.acting(memory.commands)
-        return xp.broadcast_to(acting, (NODE_COUNT, *acting.shape)), memory
+        commands = xp.broadcast_to(acting, (NODE_COUNT, *acting.shape))
+        if self.voltages is None:
+            return commands, memory
+        limits = self.voltages
+
+        def missing(voltages):
+            at_nodes = states(xp.concatenate([commands, voltages], axis=1))
+            return limits.missing(vmap(limits.asked)(at_nodes, commands))
+
+        none = xp.zeros((NODE_COUNT, self.voltages.low.shape[0], acting.shape[-1]))
+        found = newton_fixed_point(missing, none, NEWTON_ITERATIONS)
+        return xp.concatenate([commands, found], axis=1), memory
 
     def observe(self, memory, info):
         """Available readings (sensor, batch), and number of failures of the law (batch).
@@ -299,6 +325,8 @@ class SampledLoop(AbstractInputPolicy):
         signals = self.output_rows @ state[: self.model.state_count]
         if self.measured_rows is None:
             return signals
+        missing = self.model.command_matrix.shape[1] - command.shape[0]  # drive no mode at once
+        command = xp.concatenate([command, xp.zeros((missing, command.shape[1]))])
         contact = contact_at(self.model, self.loads, time, state, command)
         return self.measured_rows.with_accelerations(signals, contact.modal_acceleration)
 
@@ -504,12 +532,13 @@ def closed_loop(
         model, output_rows = with_sensor_filters(plant, law.filters)
         states = 0 if controller.open_loop else law.state_count
         model, output_rows = _with_controller_states(model, output_rows, states)
-        return ContinuousLoop(
-            plant, law, model, output_rows, least, not controller.open_loop, states
-        )
+        model, voltages = with_missing_voltages(case, plant.modal_model, model)
+        implicit = not controller.open_loop or voltages is not None
+        return ContinuousLoop(plant, law, model, output_rows, least, implicit, states, voltages)
     if not any_jax(plant, law, schedule):
         law = law.tabulated(schedule.times[schedule.control_sample >= 0])
     model, output_rows = with_sensor_filters(plant) if known is None else known[1]
+    model, voltages = with_missing_voltages(case, plant.modal_model, model)
     sections = tuple(sensor_sections(sensor, controller.period) for sensor in case.sensors)
     noise = None
     if noisy and any(sensor.noise is not None for sensor in case.sensors):
@@ -529,6 +558,8 @@ def closed_loop(
         filter_sections=sections,
         path=command_path(case),
         noise=noise,
+        voltages=voltages,
+        implicit=voltages is not None,
     )
 
 

@@ -588,7 +588,7 @@ def run_integration(
         # In continuous time from the law itself: extrapolation from the Gauss nodes is less exact.
         commands = (
             policy.commands_at(states[..., 0], times)
-            if policy.implicit
+            if policy.implicit and case.controller.period is None
             else _commands_at_steps(case, node_commands, sample_steps)
         )
     motion, vehicles = motion_at(case, model, loads, times, states, commands)
@@ -612,7 +612,9 @@ def _commands_at_steps(case: Case, commands, steps):
     histories = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
     commands_at_start = xp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
     low, high, _ = acting_ranges(case)
-    return xp.clip(commands_at_start, low, high)
+    own = len(case.actuators)
+    bounded = xp.clip(commands_at_start[:, :own], low, high)
+    return xp.concatenate([bounded, commands_at_start[:, own:]], axis=1)
 
 
 class Outputs(NamedTuple):

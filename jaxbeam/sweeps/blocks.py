@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.profiles.spectra import AbstractSpectralProfile
@@ -335,7 +336,11 @@ def suits_numpy(case: Case, batches: Batches, schedule) -> bool:
     paths, runs = batches.run_index.shape
     if not in_sequence() or len(jax.local_devices()) > 1:
         return False
-    if case.controller is not None and (runs_compiled(schedule) or case.controller.period is None):
+    if case.controller is not None and (
+        runs_compiled(schedule)
+        or case.controller.period is None
+        or limited_loops(case.actuators)  # solved in each step
+    ):
         return False
     return paths <= MAX_PATHS and paths * runs <= MAX_RUNS
 

@@ -126,6 +126,8 @@ def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Pr
     """Program of a loop, from its numbers, its other leaves (None for numbers), and its memory."""
     if loop.measured_rows is not None:
         raise UntranslatedError("readings of accelerations")
+    if loop.voltages is not None:
+        raise UntranslatedError("limits of the voltage within a step")
 
     structure, flags, *_ = kinds
 

@@ -16,11 +16,13 @@ import jaxbeam as jb
 from jaxbeam.analysis.sections import coil_history
 from jaxbeam.case.case import addresses, replace
 from jaxbeam.case.validation import check_case
+from jaxbeam.fmi import BeamSteps
 from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import poles
 from jaxbeam.runtime.arrays import xp
+from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.
@@ -183,10 +185,11 @@ def crossing(*actuators, **changes) -> jb.Case:
     return jb.Case(BEAM, actuators=actuators, **(parts | changes))
 
 
-def by_its_equations(loop, times):
+def by_its_equations(loop, times, gain=GAIN, limits=(-np.inf, np.inf), sampled=True):
     """Deflection at the sensor, current and voltage, by scipy from sine modes and the coil.
 
     States: coordinates, rates, current, integral of the error, what the sensor shows of the force.
+    Where the voltage reaches its limits, and leaves them, are events at which scipy starts anew.
     """
     wave = np.arange(1, 3) * np.pi / 0.6
     omega = wave**2 * np.sqrt(11.68 / 0.535)
@@ -199,7 +202,8 @@ def by_its_equations(loop, times):
 
     lag = loop.sensor_bandwidth if of_force else None
 
-    def rates(t, y, command):
+    def rates(t, y, command, held=None):
+        """Rates, with the voltage that the loop asks for, or with the one at which it is held."""
         coordinates, velocity, current, integral, shown = y[:2], y[2:4], *y[4:]
         mass = np.eye(2) + MASS * np.outer(at_coil, at_coil)
         suspension = DAMPING * at_coil @ velocity + STIFFNESS * at_coil @ coordinates
@@ -215,23 +219,54 @@ def by_its_equations(loop, times):
         measured = current
         if of_force:
             measured = KF * current - suspension - MASS * at_coil @ acceleration
+        if command is None:  # in continuous time
+            command = -gain * at_sensor @ coordinates
         error = command - (measured if lag is None else shown)
-        volts = p * error + q * integral
+        volts = asked = p * error + q * integral
+        if held is not None:
+            volts, error = held, error + (held - asked) / p
         rise = (volts - R * current - KV * at_coil @ velocity) / L
         follow = 0.0 if lag is None else lag * (measured - shown)
         return [*velocity, *acceleration, rise, error, follow]
 
+    def volts_asked(t, y, command, held=None):
+        return L * rates(t, y, command)[4] + R * y[4] + KV * at_coil @ y[2:4]
+
+    def passing(limit, direction):
+        def event(t, y, command, held):
+            return volts_asked(t, y, command) - limit
+
+        event.terminal, event.direction = True, direction
+        return event
+
+    limited = np.isfinite(limits).all()
     options = {"method": "LSODA", "rtol": 1e-8, "atol": 1e-11}
+    if limited:
+        options = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-12}
+
+    def until(start, end, first, command):
+        """State at the end of a period, from one event of the voltage to the next."""
+        asked = volts_asked(start, first, command)
+        held = None if limits[0] < asked < limits[1] else float(np.clip(asked, *limits))
+        while True:
+            events = [passing(limits[0], -1), passing(limits[1], 1)] if limited else None
+            if held is not None:
+                events = [passing(held, 1 if held == limits[0] else -1)]
+            found = solve_ivp(
+                rates, (start, end), first, args=(command, held), events=events, **options
+            )
+            start, first = found.t[-1], found.y[:, -1]
+            if found.status == 0:
+                return first
+            held = None if held is not None else limits[int(found.t_events[1].size > 0)]
+
     history, volts = [np.zeros(7)], []
     for start, end in itertools.pairwise(times):
-        command = -GAIN * at_sensor @ history[-1][:2]
-        span = np.linspace(start, end, 2)
-        # The voltage of the beginning period, from L I' = u - R I - K_v w'.
         first = history[-1]
-        rise = rates(start, first, command)[4]
-        volts.append(L * rise + R * first[4] + KV * at_coil @ first[2:4])
-        found = solve_ivp(rates, span, first, args=(command,), **options)
-        history.append(found.y[:, -1])
+        command = -gain * at_sensor @ first[:2] if sampled else None
+        # The voltage of the beginning period, from L I' = u - R I - K_v w'.
+        volts.append(np.clip(volts_asked(start, first, command), *limits))
+        history.append(until(start, end, first, command))
     history = np.array(history)
     return history[:, :2] @ at_sensor, history[:, 4], np.array(volts)
 
@@ -244,6 +279,59 @@ def test_crossing_under_outer_feedback(name):
     assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * np.abs(expected).max())
     for history, own in zip((coil.current, coil.voltage[:-1]), of_coil, strict=True):
         assert_allclose(history, own, atol=1e-6 * np.abs(own).max())
+
+
+LIMITED = {
+    "current": [-0.2, 0.3],
+    "current, proportional": [-0.2, 0.3],
+    "force, with the lag of its sensor": [-0.02, 0.06],
+}
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+@pytest.mark.parametrize("name", LIMITED)
+def test_a_voltage_that_reaches_its_limits(name, sampled):
+    limits = np.array(LIMITED[name]) * (1.0 if sampled else 0.2)
+    law = jb.Feedback([1e3], period=PERIOD if sampled else None)
+    case = crossing(shaker(LOOPS[name], limits=limits), controller=law)
+    record, coil = jb.simulate(case), coil_history(case)
+    assert np.isin(limits, coil.voltage).any()
+    times = np.asarray(record.times)
+    expected, *of_coil = by_its_equations(LOOPS[name], times, 1e3, limits, sampled)
+    assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * np.abs(expected).max())
+    for history, own in zip((coil.current, coil.voltage[:-1]), of_coil, strict=True):
+        assert_allclose(history, own, atol=1e-6 * np.abs(own).max())
+
+
+def test_limits_of_the_voltage_in_sweeps_and_derivatives():
+    actuator = shaker(LOOPS["current"], limits=[-0.2, 0.3])
+    case = crossing(actuator, controller=jb.Feedback([1e3], period=PERIOD))
+    masses = np.array([0.08, 0.1, 0.13])
+    found = jb.sweep(case, {"loads.0.mass": masses}).peak_deflection[:, 0]
+    peaks = [jb.simulate(jb.replace(case, {"loads.0.mass": m})).peak_deflection[0] for m in masses]
+    assert_allclose(found, peaks, rtol=1e-6)
+    plan = integration_plan(case, tolerance=1e-9)
+
+    def last(numbers):
+        names = "actuators.0.limits", "actuators.0.inner_loop.bandwidth", "loads.0.mass"
+        changes = dict(zip(names, (numbers[:2], *numbers[2:]), strict=True))
+        return jb.simulate(jb.replace(case, changes), plan=plan).deflection[-1, 0]
+
+    point = np.array([-0.2, 0.3, 900.0, 0.1])
+    derivative = jax.jit(jax.grad(last))(point)
+    assert_allclose(derivative, central(last, point), rtol=1e-5, atol=1e-9)
+
+
+def test_where_limits_of_the_voltage_are_refused():
+    case = crossing(shaker(LOOPS["current"], limits=[-0.2, 0.3]))
+    with pytest.raises(ValueError, match="within its inner loop, and a bound is that of a linear"):
+        jb.bound(case)
+    with pytest.raises(ValueError, match="and an exported beam is linear"):
+        BeamSteps(case)
+    free = dataclasses.replace(case, controller=None)
+    with pytest.raises(ValueError, match="in runs under a controller only: give one"):
+        jb.simulate(free)
+    assert jb.modes(free).frequencies.size == 2
 
 
 def test_poles_of_the_loop_with_the_coil_at_rest():
@@ -370,7 +458,7 @@ def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
         ),
         (
             shaker(jb.actuators.ForceLoop(bandwidth=1.0), limits=[-5.0, 5.0]),
-            "actuators.0.limits bound the voltage, which actuators.0.inner_loop sets beyond them",
+            "actuators.0.inner_loop.sensor_bandwidth is missing: with limits of the voltage",
         ),
         (
             shaker(jb.actuators.ForceLoop(bandwidth=-1.0)),

@@ -164,6 +164,15 @@ ACTUATORS = {
         ],
         controller=driving(2, period=0.0113),
     ),
+    "limits within loops of the current": rig(
+        [LOADS["axles"]],
+        actuators=[
+            jb.Electrodynamic(
+                0.35, **COIL, limits=(-0.2, 0.3), inner_loop=jb.actuators.CurrentLoop(900.0)
+            ),
+        ],
+        controller=driving(1, period=0.0113),
+    ),
     "gains of loops of the current": rig(
         [LOADS["axles"]],
         actuators=[

@@ -31,6 +31,7 @@ import scipy  # loads its parts on first use; all of them take a third of a seco
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import check_on_beam, refuses_traced
@@ -532,6 +533,11 @@ def checked_influence(
 
     Raises ValueError as `bound`.
     """
+    if limited := limited_loops(case.actuators):
+        raise ValueError(
+            f"actuators.{limited[0]}.limits bound the voltage within its inner loop, and a bound is"
+            " that of a linear plant: leave them out"
+        )
     check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (

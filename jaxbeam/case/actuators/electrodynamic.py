@@ -5,11 +5,14 @@ The amplifier sets the voltage u of the coil from the error e of what it measure
     u = P e + Q integral of e dt,      L I' = u - R I - K_v s',
     F = K_f I - m s'' - c s' - k s,
 
-with e = command - I, or e = command - F of the force on the beam as a sensor shows it. The loop is
-linear: the voltage that the amplifier can give does not bound it.
+with e = command - I, or e = command - F of the force on the beam as a sensor shows it. Where the
+amplifier has limits, the coil gets u* = clip(u), and the integral does not wind up: its rate is
+e + (u* - u) / P, which takes it to where u is u* in the time P / Q (back-calculation with the
+tracking time of the integral action; Åström and Hägglund 2006, section 3.5).
 """
 
 import abc
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -45,11 +48,15 @@ class PortSignal(NamedTuple):
 
 
 class LoopPort(NamedTuple):
-    """Attachment of a coil with its inner loop, its current (A) and the voltage across it (V)."""
+    """Attachment of a coil with its inner loop, its current (A) and the voltage across it (V).
+
+    `on_missing` are the rates of the states per voltage that is missing to the one asked for.
+    """
 
     attachment: Attachment
     current: PortSignal
     voltage: PortSignal
+    on_missing: Float[Array, " state"]
 
 
 class AbstractInnerLoop(ReprWithUnits):
@@ -61,6 +68,11 @@ class AbstractInnerLoop(ReprWithUnits):
     proportional: eqx.AbstractVar[Float[Array, ""] | None]
     integral: eqx.AbstractVar[Float[Array, ""] | None]
     limits: eqx.AbstractVar[Float[Array, "2"] | None]
+
+    @property
+    def voltage_follows_states(self) -> bool:
+        """Whether no acceleration of the moving mass enters the voltage at once."""
+        return True
 
     @abc.abstractmethod
     def port(self, coil: Coil) -> LoopPort:
@@ -155,6 +167,10 @@ class ForceLoop(AbstractInnerLoop):
         "N", "smallest and largest force commanded", INCREASING, default=None
     )
 
+    @property
+    def voltage_follows_states(self):
+        return self.sensor_bandwidth is not None
+
     def port(self, coil: Coil) -> LoopPort:
         constant = coil.force_constant
         gains = _gains(self, coil.inductance / constant, coil.resistance / constant)
@@ -172,12 +188,14 @@ def coil_alone(coil: Coil) -> LoopPort:
     velocity = xp.stack([xp.zeros(()), -coil.back_emf, xp.zeros(())])
     matrix, columns = -coil.resistance[None, None], velocity[None]
     voltage = PortSignal(xp.zeros(1), xp.ones(()), xp.zeros(3))
+    on_voltage = 1 / coil.inductance[None]
     return _port(
         coil,
         matrix / coil.inductance,
-        1 / coil.inductance[None],
+        on_voltage,
         columns / coil.inductance,
         voltage,
+        on_voltage,
     )
 
 
@@ -205,12 +223,14 @@ def _closed(coil: Coil, gains, error_states, error_port, sensor=None) -> LoopPor
         rows.append(sensor[0])
         columns.append(sensor[1])
     commands = [proportional / coil.inductance] + [zero] * len(rows)
+    on_missing = [1 / coil.inductance] + [zero] * len(rows)
     if integral is not None:
         states = xp.concatenate([states, integral[None]])
         rows = [xp.concatenate([row, xp.zeros(1)]) for row in rows]
         rows.append(xp.concatenate([error_states, xp.zeros(1)]))
         columns.append(error_port)
         commands.append(xp.ones(()))
+        on_missing.append(1 / proportional)
     emf = xp.stack([zero, coil.back_emf, zero])
     resistance = coil.resistance * xp.eye(states.shape[0])[0]
     return _port(
@@ -219,10 +239,11 @@ def _closed(coil: Coil, gains, error_states, error_port, sensor=None) -> LoopPor
         xp.stack(commands),
         xp.stack([(port - emf) / coil.inductance, *columns]),
         PortSignal(states, proportional, port),
+        xp.stack(on_missing),
     )
 
 
-def _port(coil: Coil, matrix, commands, columns, voltage: PortSignal) -> LoopPort:
+def _port(coil: Coil, matrix, commands, columns, voltage: PortSignal, on_missing) -> LoopPort:
     """Port of z' = matrix z + commands u + columns (s, s', s''), whose first state is the current.
 
     An attachment depends on s' alone. With z = y + a s + b s', a = -matrix^-1 columns_s and
@@ -248,7 +269,7 @@ def _port(coil: Coil, matrix, commands, columns, voltage: PortSignal) -> LoopPor
         damping=coil.damping - coil.force_constant * current.port[1],
         mass=coil.mass,
     )
-    return LoopPort(attachment, current, shown(voltage))
+    return LoopPort(attachment, current, shown(voltage), on_missing)
 
 
 class Electrodynamic(AbstractActuator):
@@ -259,10 +280,10 @@ class Electrodynamic(AbstractActuator):
     command of zero shorts the coil; its back-EMF then damps the beam.
 
     With an `inner_loop` the amplifier sets the voltage, and the command is a current in A
-    (`CurrentLoop`) or a force in N (`ForceLoop`), bounded by the `limits` of the loop. Where the
-    amplifier runs out of voltage is not modelled: `limits` of the voltage are refused with a loop;
-    the voltage of a run is in `jaxbeam.analysis.sections`, that per command in
-    `jaxbeam frf`.
+    (`CurrentLoop`) or a force in N (`ForceLoop`), bounded by the `limits` of the loop. The
+    `limits` of the voltage then bound what the loop asks for, in runs under a controller; designs,
+    margins and frequency responses are those within them. The voltage of a run is in
+    `jaxbeam.analysis.sections.coil_history`, that per command in `jaxbeam frf`.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -327,11 +348,24 @@ class Electrodynamic(AbstractActuator):
     def validate(self, address: str) -> str | None:
         if self.inner_loop is None:
             return None
-        if self.limits is not None:
-            return (
-                f"{address}.limits bound the voltage, which {address}.inner_loop sets beyond them:"
-                f" give {address}.inner_loop.limits, in {self.inner_loop.command_unit}, or leave"
-                " the loop out"
-            )
         error = self.inner_loop.validate()
-        return None if error is None else f"{address}.inner_loop.{error}"
+        if error is not None:
+            return f"{address}.inner_loop.{error}"
+        if self.limits is not None and not self.inner_loop.voltage_follows_states:
+            return (
+                f"{address}.inner_loop.sensor_bandwidth is missing: with limits of the voltage the"
+                " signal of the force sensor needs a lag, as the force follows the acceleration of"
+                f" {address}.mass at once"
+            )
+        return None
+
+
+def limited_loops(actuators: Sequence[AbstractActuator]) -> tuple[int, ...]:
+    """Indices of the shakers whose voltage has limits within an inner loop."""
+    return tuple(
+        i
+        for i, actuator in enumerate(actuators)
+        if isinstance(actuator, Electrodynamic)
+        and actuator.inner_loop is not None
+        and actuator.limits is not None
+    )

@@ -229,7 +229,8 @@ def least_command(facts):
             low, high = map(float, limits)
             words = {"low": low, "high": high, "unit": actuator.command_unit}
             words["size"] = max(abs(low), abs(high))
-            name = "limits" if actuator.limits is not None else "inner_loop.limits"
+            looped = getattr(actuator, "inner_loop", None) is not None
+            name = "inner_loop.limits" if looped else "limits"
             yield Value(f"{address}.{name}", max(low, -high, 0.0), words)
 
 
