@@ -51,6 +51,10 @@ class AbstractInputPolicy(Module):
         If `implicit`, `states` maps commands to the states at the nodes (node, state, batch).
         """
 
+    def of_time(self, infos: StepInfo) -> Float[Array, "*step node actuator"] | None:
+        """Commands of a step, or of several, if they depend on time alone; else None."""
+        return None
+
     @abc.abstractmethod
     def observe(self, memory, info: StepInfo) -> Any:
         """Values to be saved at the start of a step with an event, batch axis last, or None."""

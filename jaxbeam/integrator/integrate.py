@@ -156,9 +156,14 @@ def _advance_concrete(policy, of_states, infos, state, memory):
     sources = np.ones((count + 1, batch_size, of_states.linear.shape[-1]))
     sources[0, :, :state_count] = state.T
     events, observations, held = infos.event.tolist(), [], None
+    given, observed = policy.of_time(infos), None
+    if any_jax(given):
+        return None
     for i in range(count):
         state = sources[i, :, :state_count]
-        if events[i] >= 0 or i == 0 or not policy.holds_commands:
+        if given is not None:
+            held = given[i].ravel()
+        elif events[i] >= 0 or i == 0 or not policy.holds_commands:
             info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
             node_commands, memory = policy.inputs(memory, state.T, info, None)
             if i == 0 and any_jax(node_commands, memory):

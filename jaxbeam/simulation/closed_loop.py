@@ -88,13 +88,11 @@ class ContinuousLoop(AbstractInputPolicy):
         return xp.zeros((self.model.command_matrix.shape[1], batch_size))
 
     def inputs(self, memory, state, info: StepInfo, states):
-        # In a step of no length, commands that jump at its start have jumped.
-        length = xp.maximum(info.length, SHORTEST_STEP * (1 + info.start))
-        times = info.start + length * GAUSS_NODES
         if not self.implicit:
-            commands = self._open_loop_commands(times)[..., None]
+            commands = self.of_time(info)[..., None]
             commands = xp.broadcast_to(commands, (*commands.shape[:2], state.shape[-1]))
             return commands, commands[-1]
+        times = _node_times(info)
 
         def commands_for(commands):
             of_batch = vmap(self._commands, in_axes=(-1, None), out_axes=-1)
@@ -108,6 +106,12 @@ class ContinuousLoop(AbstractInputPolicy):
         guess = xp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
         commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
         return commands, commands[-1]
+
+    def of_time(self, infos):
+        if self.implicit:
+            return None
+        times = _node_times(infos)
+        return self._open_loop_commands(times.ravel()).reshape(*times.shape, -1)
 
     def observe(self, memory, info):
         return None
@@ -133,7 +137,15 @@ class ContinuousLoop(AbstractInputPolicy):
         states = self.plant.modal_model.state_count
         nothing = Measurement(xp.zeros(sensors), xp.zeros(states), no_command)
         law_state = xp.zeros(0)
-        commands = vmap(lambda time: self.law.command(law_state, nothing, time))(times)
+
+        def of_time(time):
+            return self.law.command(law_state, nothing, time)
+
+        commands = None
+        if not any_jax(self, times):
+            with contextlib.suppress(NotVectorisedError):
+                commands = vectorised(of_time)(times)
+        commands = vmap(of_time)(times) if commands is None else commands
         return limit_commands(self.plant.case, commands.T).T
 
     def _commands(self, state, time):
@@ -153,6 +165,15 @@ class ContinuousLoop(AbstractInputPolicy):
         if self.voltages is None:
             return xp.concatenate([command, rates])
         return xp.concatenate([command, rates, self.voltages.asked(state, command)])
+
+
+def _node_times(infos: StepInfo) -> Float[Array, "*step node"]:
+    """Times (s) of the Gauss nodes of a step, or of several.
+
+    In a step of no length, commands that jump at its start have jumped.
+    """
+    length = xp.maximum(infos.length, SHORTEST_STEP * (1 + infos.start))
+    return infos.start[..., None] + length[..., None] * GAUSS_NODES
 
 
 def newton_fixed_point(
