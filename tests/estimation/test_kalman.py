@@ -38,6 +38,7 @@ CASE = jb.Case(
     loads=[jb.MovingMass(mass=0.4, speed=0.5, entry_time=-0.4)],
     controller=jb.Prescribed([0.0], period=PERIOD),
 )
+DIRECT = dataclasses.replace(CASE, actuators=(jb.PointForce(0.4),))  # whose force is the command
 OFFSET = np.array([1e-4, 0.0, 0.0, 0.0])
 FORCES = np.array([1e-2, 2e-2])
 DEVIATION = 2.0
@@ -77,7 +78,8 @@ def oracle(case, samples, delay=0.0, loaded=True):
     """Transitions and rows (C, D) of the readings at the samples, by the oracle."""
     span, loads, actuators, sensors = parts_of(case)
     plant = SampledPlant(span, loads if loaded else [], actuators, sensors)
-    intensity = np.diag([0.0, 0.0, *FORCES, 0.0, *([0.0] * loaded)])
+    lags = [0.0 for actuator in actuators if actuator.lag is not None]
+    intensity = np.diag([0.0, 0.0, *FORCES, *lags, *([0.0] * loaded)])
     times = PERIOD * np.arange(samples if loaded else 1)
     steps = [plant.step(t, PERIOD, delay, intensity) for t in times]
     rows = [plant.matrices(t)[2:] for t in times]
@@ -90,6 +92,7 @@ def signals(samples):
     return random.normal(size=(samples, 1)), NOISE * random.normal(size=(samples, 4)) * 10
 
 
+@pytest.mark.parametrize("case", [CASE, DIRECT], ids=["shaker", "force"])
 @pytest.mark.parametrize(
     ("kalman", "delay", "samples"),
     [
@@ -99,15 +102,15 @@ def signals(samples):
     ],
     ids=lambda x: getattr(x, "loads", None),
 )
-def test_estimates_by_gaussian_conditioning(kalman, delay, samples):
+def test_estimates_by_gaussian_conditioning(kalman, delay, samples, case):
     """The time-invariant filter has forgotten its initial state by the last sample."""
     loaded = kalman.loads != "ignored"
     commands, readings = signals(samples)
     filter_state, (estimate, _) = filter_readings(
-        kalman, with_delay(CASE, delay), commands, readings
+        kalman, with_delay(case, delay), commands, readings
     )
     remainder = 0.0 if delay is None else delay % PERIOD
-    steps, rows = oracle(CASE, samples, remainder, loaded)
+    steps, rows = oracle(case, samples, remainder, loaded)
     size = steps[0].transition.shape[0]
     mean, covariance = np.zeros(size), np.zeros((size, size))
     if loaded:
