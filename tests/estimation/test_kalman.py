@@ -215,6 +215,25 @@ def followed(estimator, case, readings, layout=None):
     return estimates, state
 
 
+def test_an_acceleration_that_is_that_of_the_command_tells_nothing():
+    """Before the load comes: q'' = phi u - 2 zeta w q' - w^2 q of each mode."""
+    sensors = [jb.Sensor(0.17), jb.Sensor(0.35, "acceleration")]
+    case = dataclasses.replace(
+        crossing(jb.MovingMass(mass=0.4, speed=2.0, entry_time=0.02)), sensors=sensors
+    )
+    plant, command = jb.state_space(case), np.array([0.3])
+    filter = FOLLOWS.sampled_filter(plant, sample_timing(case.controller))
+    predicted, _ = filter.predict(filter.initial_state(), command, np.asarray(0.0))
+    q, rates = predicted[:2], predicted[2:4]
+    w = (np.arange(1, 3) * np.pi / LENGTH) ** 2 * (11.68 / 0.535) ** 0.5
+    shapes = plant.modal_model.modes.shapes(np.array([0.17, 0.35, 0.4]))
+    accelerations = 0.3 * shapes[2] - 0.06 * w * rates - w**2 * q
+    readings = np.array([shapes[0] @ q, shapes[1] @ accelerations])
+    measurement = Measurement(readings, np.zeros(4), command)
+    estimate, _ = filter.update(filter.initial_state(), measurement, np.asarray(0.0))
+    assert_allclose(estimate.state, predicted[:4], rtol=1e-6, atol=1e-15)
+
+
 def deflections_by_scipy(case):
     return expected(case, np.arange(0.0, float(case.run.duration), EXTENDED_PERIOD)).deflection
 
