@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
+from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.inversion import Inversion
@@ -205,3 +206,23 @@ def test_errors_of_settings(estimator, period, message):
     law = dataclasses.replace(case.controller, period=period)
     with pytest.raises(ValueError, match=message):
         check_case(dataclasses.replace(case, controller=law))
+
+
+@pytest.mark.parametrize("name", ["time-invariant", "known"])
+def test_readings_that_are_those_of_the_estimate_do_not_change_its_motion(name):
+    """Accelerations answer to the command of a force at once: phi u - 2 zeta w q' - w^2 q."""
+    sensors = jb.Sensor(0.17, offset=1e-5), jb.Sensor(0.25, "acceleration")
+    case = dataclasses.replace(
+        loop(ESTIMATORS[name], 2), actuators=(jb.PointForce(0.4),), sensors=sensors
+    )
+    plant = jb.state_space(case)
+    filter = ESTIMATORS[name].continuous_filter(plant)
+    q, rates, command = np.array([1e-3, -2e-4]), np.array([0.02, 0.05]), np.array([0.7])
+    state = np.append([*q, *rates], np.zeros(filter.initial.size - 4)) - filter.initial
+    state[4:] = 0.0
+    w = (np.arange(1, 3) * np.pi / 0.6) ** 2 * (11.68 / 0.535) ** 0.5
+    shapes = plant.modal_model.modes.shapes(np.array([0.17, 0.25, 0.4]))
+    accelerations = command * shapes[2] - 0.02 * w * rates - w**2 * q
+    readings = np.array([shapes[0] @ q + 1e-5, shapes[1] @ accelerations])
+    found = filter.rates(state, Measurement(readings, np.zeros(1), command), command, 0.0)
+    assert_allclose(found[:4], [*rates, *accelerations], rtol=1e-7)
