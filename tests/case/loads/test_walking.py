@@ -57,6 +57,19 @@ def test_jogging_is_a_half_sine(share):
         assert_allclose(found, moments, atol=1e-10)
 
 
+def test_a_jogger_of_a_given_contact_time_is_a_row_of_half_sines():
+    """Each step carries the weight of its period: W pi T / (2 t_c) sin(pi t / t_c)."""
+    jogger = jb.Pedestrian(
+        pace=2.5, weight=700.0, activity="jogging", contact_time=0.3, harmonics=100, speed=2.0
+    )
+    check_case(jb.Case(jb.Beam(20.0, 1e9, 2e3), loads=[jogger]))
+    times = np.linspace(0.0, 0.8, 81)  # of two steps
+    since = times % 0.4
+    pulse = 700.0 * np.pi * 0.4 / (2 * 0.3) * np.sin(np.pi * since / 0.3)
+    found = 700.0 + jogger.step_history(np.array(2.5), 0.0).at(times)
+    assert_allclose(found, np.where(since < 0.3, pulse, 0.0), atol=5.0)
+
+
 def test_contact_time_of_a_jogger():
     assert_allclose(contact_time(np.array(2.5)), 0.2751, atol=1e-4)  # 1.8 x 2.5^-2.05
 
