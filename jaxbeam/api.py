@@ -172,8 +172,8 @@ def _content_of_record(record: Record) -> dict[str, Any]:
     if record.case.absorbers:
         found["absorbers"] = {
             "position": [absorber.position for absorber in record.case.absorbers],
-            "largest_stroke": abs(record.stroke).max(axis=0),
-            "largest_force": abs(record.absorber_force).max(axis=0),
+            "largest_stroke": record.peak_stroke,
+            "largest_force": record.peak_absorber_force,
             "energy": record.absorber_energy[-1],
         }
     ride = ride_of(record)

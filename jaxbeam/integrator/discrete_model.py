@@ -168,9 +168,10 @@ class DiscreteModel(Module):
     Outputs are deflections, or other quantities of sensors. `energy_bounds` bound each of them by
     the energies of the blocks (see `bounds_by_energy`). With `with_node_states`, step matrices
     include the states at the nodes. `load_influence` is the direct influence of forces on outputs
-    with a static correction. Peaks are those of the `magnitude` of an output, by default its
-    absolute value. The last outputs are deflections at the `absorbers`, given twice, in place of
-    which peaks are those of their strokes (m) and then forces (N).
+    with a static correction. Peaks are those of the absolute value of an output; with `both_ways`
+    those of all outputs, then of their negatives. The last outputs are deflections at the
+    `absorbers`, given twice, in place of which peaks are those of their strokes (m) and then
+    forces (N).
     """
 
     model: ModalModel
@@ -182,13 +183,18 @@ class DiscreteModel(Module):
     modal_command_matrix: Float[Array, "mode actuator"] | None
     with_node_states: bool = eqx.field(static=True)
     load_influence: LoadInfluence | None = None
-    magnitude: Callable = eqx.field(static=True, default=abs)
+    both_ways: bool = eqx.field(static=True, default=False)
     absorbers: int = eqx.field(static=True, default=0)
 
     @property
     def position_count(self) -> int:
         """Number of monitored positions."""
         return 0 if self.energy_bounds is None else self.energy_bounds.shape[0]
+
+    @property
+    def magnitude(self) -> Callable:
+        """Function of a monitored value whose largest value is its peak."""
+        return operator.pos if self.both_ways else abs
 
 
 def discrete_model(
@@ -234,21 +240,6 @@ def discrete_model(
 
 
 def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
-    """Discrete model that monitors each position twice: upward deflections, then downward ones."""
-
-    def both_signs(rows):
-        split = rows.reshape(
-            rows.shape[0], len(PEAK_NODES), discrete.position_count, *rows.shape[2:]
-        )
-        both = xp.concatenate([split, -split], axis=2)
-        return both.reshape(rows.shape[0], -1, *rows.shape[2:])
-
-    influence = discrete.load_influence
-    return dataclasses.replace(
-        discrete,
-        load_influence=influence and dataclasses.replace(influence, mirrored=True),
-        monitored_transition=both_signs(discrete.monitored_transition),
-        monitored_input=both_signs(discrete.monitored_input),
-        energy_bounds=xp.tile(discrete.energy_bounds, (2, 1)),
-        magnitude=operator.pos,
-    )
+    """Discrete model that has two peaks of each output: the largest, then that of its negative."""
+    bounds = xp.tile(discrete.energy_bounds, (2, 1))
+    return dataclasses.replace(discrete, energy_bounds=bounds, both_ways=True)

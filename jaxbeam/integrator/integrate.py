@@ -9,7 +9,6 @@ advances the states (`step`), and peaks are updated for the chunk at once (`runn
 Commands to the actuators are polynomials through the same nodes, given by an input policy.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -294,16 +293,28 @@ def _chunk_function(
             before = states[:, : discrete.model.state_count]
             ends = _end_forces(loads, path, steps, before, state, forces)
             inputs = [before, forces, ends, commands]
-            of_absorbers = None
-            if discrete.absorbers:
-                moving = xp.concatenate([states, state[None]])[:, discrete.model.state_count :]
-                of_absorbers = functools.partial(
-                    absorber_samples, loads, path, discrete.absorbers, moving, forces
-                )
-            running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs, of_absorbers)
+            after = xp.concatenate([states[1:], state[None]])
+            monitored = _monitored(discrete, loads, path, states, after, forces)
+            running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs, monitored)
         return state, memory, running_peaks, end, (states, commands, observed)
 
     return chunk, chunk_steps
+
+
+def _monitored(discrete: DiscreteModel, loads: LoadSet, path: LoadPath, before, after, forces):
+    """Function from samples of the outputs of steps to those of which there are peaks.
+
+    `before` and `after` are states at the ends of the steps, `forces` (N) those at their nodes.
+    """
+    own, count = np.s_[:, discrete.model.state_count :], discrete.absorbers
+
+    def monitored(samples):
+        if count:
+            moving = before[own], after[own]
+            samples = absorber_samples(loads, path, count, *moving, forces, samples)
+        return xp.concatenate([samples, -samples], axis=2) if discrete.both_ways else samples
+
+    return monitored
 
 
 def _end_forces(loads: LoadSet, path: LoadPath, steps: StepInput, before, last, forces):
@@ -334,7 +345,7 @@ def peaks_of_halves(
     path = load_path(discrete, loads, max_loads, (2 * index[:, None] + np.arange(2)).ravel())
     steps = step_inputs(discrete, loads, path)
     maps = step_maps(steps, vehicles_of(loads, discrete.grid.lengths))
-    state, sources, ends = np.swapaxes(states[index], 1, 2), [], None
+    state, sources, after, ends = np.swapaxes(states[index], 1, 2), [], [], None
     for half in range(2):
         parts = [state]
         if commands is not None:
@@ -344,6 +355,7 @@ def peaks_of_halves(
             parts.append(np.swapaxes(own.reshape(index.size, *commands.shape[1:]), 1, 2))
         sources.append(np.concatenate(parts, axis=2))
         state = maps.states.at(np.s_[half::2], sources[-1])
+        after.append(np.swapaxes(state, 1, 2))
     columns = np.stack(sources, axis=1).reshape(path.start.size, *sources[0].shape[1:])
     forces, columns = (np.swapaxes(part, 1, 2) for part in (maps.forces(columns), columns))
     before, count = columns[:, : discrete.model.state_count], states.shape[1]
@@ -358,7 +370,9 @@ def peaks_of_halves(
     load_count, batch_size = loads.inertia.shape
     first = initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     inputs = before, forces, ends, None if commands is None else columns[:, count:]
-    return update_peaks(first, steps.matrices, path, inputs)
+    after = np.stack(after, axis=1).reshape(path.start.size, *after[0].shape[1:])
+    monitored = _monitored(discrete, loads, path, columns[:, :count], after, forces)
+    return update_peaks(first, steps.matrices, path, inputs, monitored)
 
 
 def _initial_state(discrete: DiscreteModel, loads: LoadSet, policy) -> Float[Array, "state batch"]:

@@ -107,13 +107,13 @@ def update_peaks(
     matrices: StepMatrices,
     path: LoadPath,
     inputs,
-    of_absorbers: Callable | None = None,
+    monitored: Callable,
 ) -> RunningPeaks:
     """Running peaks after a further chunk of steps.
 
     `inputs` of the monitored outputs are states, contact forces at the nodes, contact forces at the
-    ends of the steps, and commands; the last two may be None. `of_absorbers`, if given, takes
-    samples (step, sample, output, batch) to those with strokes and forces of absorbers.
+    ends of the steps, and commands; the last two may be None. `monitored` takes samples of the
+    outputs (step, sample, output, batch) to those of which there are peaks.
     """
     states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
@@ -127,9 +127,7 @@ def update_peaks(
         outputs = on_states @ states + on_others @ xp.concatenate(others, axis=1)
         # Steps of zero length after the end are no part of the run.
         outputs = xp.where(length[:, None, None] > 0, outputs, 0.0)
-    samples = outputs.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    if of_absorbers is not None:
-        samples = of_absorbers(samples)
+    samples = monitored(outputs.reshape(steps, len(PEAK_NODES), -1, batch_size))
     samples = optimization_barrier(samples)
 
     largest = xp.max(xp.abs(samples), axis=(0, 1))

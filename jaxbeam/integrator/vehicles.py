@@ -322,15 +322,16 @@ def absorber_samples(
     loads: LoadSet,
     path: LoadPath,
     count: int,
-    moving: Float[Array, "boundary vehicle_state batch"],
+    before: Float[Array, "step vehicle_state batch"],
+    after: Float[Array, "step vehicle_state batch"],
     forces: Float[Array, "step row batch"],
     samples: Float[Array, "step sample output batch"],
 ) -> Float[Array, "step sample output batch"]:
     """Samples of outputs with strokes (m), then forces (N), of the last `count` wheels.
 
-    In the place of these, samples have the deflections at the absorbers, twice. `moving` are the
-    states of all vehicles before each step and at the end. Heights of the body in a step are a
-    line through those at its ends, and the double integral of F / m_t, with the force F that
+    In the place of these, samples have the deflections at the absorbers, twice. `before` and
+    `after` are the states of all vehicles at the ends of each step. Heights of the body in a step
+    are a line through those at its ends, and the double integral of F / m_t, with the force F that
     accelerates its inertia m_t (see `jaxbeam.case.absorbers`). What hangs on the beam has no
     profile under it.
     """
@@ -343,13 +344,11 @@ def absorber_samples(
     own = (path.loads[:, :, None] == index) & path.pressing[:, :, None]
     force = xp.sum(xp.where(own[..., None, None], by_row, 0.0), axis=1)  # step, absorber, node
     deflection = samples[:, :, -count:]
-    height = moving[:, -2 * count :: 2]
+    heights = before[:, -2 * count :: 2], after[:, -2 * count :: 2]
     if path.surface is not None:
         at_rest = path.surface[:, 0, index, 0]
         at_rest = at_rest.reshape(*at_rest.shape[:2], -1)
-        heights = height[:-1] - at_rest, height[1:] - at_rest
-    else:
-        heights = height[:-1], height[1:]
+        heights = heights[0] - at_rest, heights[1] - at_rest
     first, last = (
         fraction * z + (1 - fraction) * y
         for z, y in zip(heights, (deflection[:, 0], deflection[:, -1]), strict=True)

@@ -7,7 +7,6 @@ Static influence of forces over their position: Chebyshev series.
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -301,13 +300,12 @@ class LoadInfluence(Module):
     The static influence of a force less that of the modes kept.
 
     Chebyshev `series` of the outputs per newton upwards between the `breaks` (m): nodes of the
-    beam, and the outputs, at which moments have kinks and shear forces jump. `mirrored` outputs are
-    those, then their negatives. `twist` is the series per unit of torque, where the beam twists.
+    beam, and the outputs, at which moments have kinks and shear forces jump. `twist` is the series
+    per unit of torque, where the beam twists.
     """
 
     breaks: Float[Array, " break"]
     series: Float[Array, "piece term output"]
-    mirrored: bool = eqx.field(static=True, default=False)
     twist: Float[Array, "piece term output"] | None = None
 
     def of_forces_at(
@@ -338,7 +336,7 @@ class LoadInfluence(Module):
         if eccentricity is not None and self.twist is not None:
             of_torque = xp.einsum("...k,...ko->...o", table, take(self.twist, piece))
             influence = influence + xp.asarray(eccentricity)[..., None] * of_torque
-        return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
+        return influence
 
     def spread(self, kernel: Kernel) -> "LoadInfluence":
         """Influence per newton of an axle, whose force the track's `kernel` spreads."""
@@ -346,7 +344,7 @@ class LoadInfluence(Module):
         twist = self.twist
         if twist is not None:
             twist = spread_series(kernel, self.breaks, twist)[1]
-        return LoadInfluence(nodes, series, self.mirrored, twist)
+        return LoadInfluence(nodes, series, twist)
 
     def plus(self, other: "LoadInfluence") -> "LoadInfluence":
         """Sum with another, whose breaks are among those of this one."""

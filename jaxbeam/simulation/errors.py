@@ -33,11 +33,15 @@ class Extremes(NamedTuple):
     largest_time: Float[Array, " sensor"]
 
 
-def monitored_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
-    """Deflections at all sensors, then the other quantities of those that measure others."""
-    others = (sensor for sensor in sensors if sensor.quantity != "deflection")
-    places = (Sensor(one.position, eccentricity=one.eccentricity) for one in sensors)
-    return *places, *others
+def monitored_sensors(case: Case) -> tuple[Sensor, ...]:
+    """Deflections at all sensors, then the other quantities of those that measure others.
+
+    Then the deflections at the absorbers, twice: of strokes and of forces.
+    """
+    others = (sensor for sensor in case.sensors if sensor.quantity != "deflection")
+    places = (Sensor(one.position, eccentricity=one.eccentricity) for one in case.sensors)
+    hung = [Sensor(one.position) for one in case.absorbers]
+    return *places, *others, *hung, *hung
 
 
 def own_outputs(sensors: Sequence[Sensor]) -> Int[np.ndarray, " sensor"]:
@@ -63,6 +67,16 @@ def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, 
     deflection = xp.where(is_up, up[every], down[every])
     time = xp.where(is_up, up_time[every], down_time[every])
     return extremes, peaks._replace(peak_deflection=deflection, peak_time=time)
+
+
+def absorber_peaks(case: Case, heights: Float[Array, " output"]) -> dict[str, Array]:
+    """Largest absolute strokes (m) and forces (N) of the absorbers of a case.
+
+    `heights` are the peaks of `monitored_sensors`, upwards, then downwards.
+    """
+    count, (up, down) = len(case.absorbers), xp.split(heights, 2)
+    stroke, force = xp.split(xp.maximum(up, down)[up.shape[0] - 2 * count :], 2)
+    return {"peak_stroke": stroke, "peak_absorber_force": force}
 
 
 LEFT_OUT = 3  # highest modes whose dynamic part estimates that of all modes beyond

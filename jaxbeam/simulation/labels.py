@@ -174,6 +174,8 @@ OF_ABSORBERS = {
     "stroke": (("time", "absorber"), "m", "motion of the absorber's body relative to the beam"),
     "absorber_force": (("time", "absorber"), "N", "force on the beam, positive downwards"),
     "absorber_energy": (("time", "absorber"), "J", "energy dissipated so far"),
+    "peak_stroke": (("absorber",), "m", "largest absolute stroke of the absorber"),
+    "peak_absorber_force": (("absorber",), "N", "largest absolute force of the absorber"),
 }
 # With unilateral contact; names in files begin with flight_.
 OF_FLIGHTS = {
@@ -190,8 +192,7 @@ OF_FLIGHTS = {
 ACTING_COMMAND = (("time", "actuator"), "unit of a command", "command that acts on the beam")
 # Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {
-    "peak_stroke": (("absorber",), "m", "largest absolute stroke of the absorber"),
-    "peak_absorber_force": (("absorber",), "N", "largest absolute force of the absorber"),
+    **OF_ABSORBERS,
     "controller_failures": ((), "1", "steps at which the controller found no solution"),
 }
 

@@ -238,7 +238,8 @@ class Record(RecordViews):
     the largest value of what each sensor measures; both have no derivatives, which `grad` refuses
     and `jvp` gives as NaN. `controller_readings` are the readings that a sampled controller has
     received, None without one; `acting_command` are the commands behind hysteresis and creep of the
-    actuators, None if no actuator has any. `result` is zero, or the sum of what is wrong with the
+    actuators, None if no actuator has any. `peak_stroke` (m) and `peak_absorber_force` (N) are the
+    largest absolute ones of each absorber. `result` is zero, or the sum of what is wrong with the
     run (see `Result`).
 
     >>> import jaxbeam as jb
@@ -279,6 +280,8 @@ class Record(RecordViews):
     body_acceleration: Float[Array, "time body"]
     error_estimate: Float[Array, ""]
     step_errors: Float[Array, " sensor"]
+    peak_stroke: Float[Array, " absorber"]
+    peak_absorber_force: Float[Array, " absorber"]
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
     acting_command: Float[Array, "time actuator"] | None = None
@@ -518,9 +521,9 @@ class Record(RecordViews):
 
     def _stroke_sentences(self) -> list[str]:
         """Sentences on absorbers whose stroke exceeds the largest allowed."""
-        strokes, found = np.abs(np.asarray(concrete(self.stroke))).max(axis=0, initial=0.0), []
-        for i, (absorber, stroke) in enumerate(zip(self.case.absorbers, strokes, strict=True)):
-            largest = absorber.max_stroke
+        found = []
+        for i, absorber in enumerate(self.case.absorbers):
+            largest, stroke = absorber.max_stroke, float(concrete(self.peak_stroke[i]))
             if largest is not None and stroke > (limit := float(concrete(largest))):
                 found.append(f"the stroke of absorber {i} is {stroke:.4g} m, above {limit:.4g} m")
         return found

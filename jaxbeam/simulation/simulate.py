@@ -48,7 +48,12 @@ from jaxbeam.simulation.closed_loop import (
     with_fixed_losses,
 )
 from jaxbeam.simulation.commands import acting_ranges
-from jaxbeam.simulation.errors import monitored_sensors, peak_errors, sensor_extremes
+from jaxbeam.simulation.errors import (
+    absorber_peaks,
+    monitored_sensors,
+    peak_errors,
+    sensor_extremes,
+)
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
     IntegrationPlan,
@@ -173,7 +178,7 @@ def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integ
     """Unilateral run of a case by a plan for `held`, the case with bilateral contact."""
     from jaxbeam.simulation.unilateral import motion_at_samples, peaks_of_run, run_unilateral
 
-    monitored = monitored_sensors(case.sensors)
+    monitored = monitored_sensors(case)
     setup = integration_setup(held, plan, times, monitored)
     model, loads, grid = setup.model.model, setup.loads, setup.model.grid
     events = np.asarray(loads.events(event_places(model, None))[1])
@@ -336,7 +341,7 @@ class _FirstRun:
 @compiled_if_traced
 def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
     """Record of a run without its errors, and its states and commands at all events."""
-    monitored = monitored_sensors(case.sensors)
+    monitored = monitored_sensors(case)
     integration = run_integration(case, plan, times, monitored, policy=policy)
     event = integration.grid.event_at(np.arange(integration.steps))
     events = plan.schedule.times.shape[0]
@@ -354,7 +359,7 @@ def _simulate_record(
     case: Case, plan: IntegrationPlan, times, errors, tolerance: float, inside, policy=None
 ) -> Record:
     times = times_of_samples(case, times) if isinstance(times, int) else times
-    monitored = monitored_sensors(case.sensors)
+    monitored = monitored_sensors(case)
     integration = run_integration(case, plan, times, monitored, policy=policy)
     record = _record(case, integration, times)
     return _with_result(record, errors, tolerance, inside)
@@ -388,6 +393,7 @@ def _record(case: Case, integration: "Integration", times) -> Record:
         controller_readings=outputs.readings,
         **peaks._asdict(),
         **extremes._asdict(),
+        **absorber_peaks(case, heights),
         contact_lost_position=lost_positions,
         error_estimate=xp.where(diverged, xp.nan, of_peaks[0]),
         step_errors=xp.where(diverged, xp.nan, of_peaks[1]),
@@ -500,7 +506,7 @@ def integration_setup(
     """Setup of a planned integration; without noise unless `noisy`.
 
     The input `policy` is that of the case if left out. Peaks are those of what the `monitored`
-    sensors measure, upwards, then downwards.
+    sensors measure, upwards, then downwards; the last are at the absorbers (`monitored_sensors`).
     """
     layout = plan.shapes.layout
     loads = load_set(case, layout)
@@ -524,6 +530,7 @@ def integration_setup(
 
     def on_grid(grid):
         discrete = discrete_model(model, grid, None, policy, outputs, correction)
+        discrete = dataclasses.replace(discrete, absorbers=len(case.absorbers))
         return discrete if outputs is None else signed_both_ways(discrete)
 
     sample_steps = plan.substeps * grid.event_panels[schedule.sample_events]

@@ -18,13 +18,21 @@ from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.torsion import twists
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
-from jaxbeam.simulation.labels import MODE_FIELDS, MODE_VARIABLES, OF_FLIGHTS, VARIABLES, Flights
+from jaxbeam.simulation.labels import (
+    MODE_FIELDS,
+    MODE_VARIABLES,
+    OF_ABSORBERS,
+    OF_FLIGHTS,
+    VARIABLES,
+    Flights,
+)
 from jaxbeam.simulation.record import Record
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
-_STORED_VARIABLES = [name for name in VARIABLES if name in Record.__annotations__]
+_VARIABLES = VARIABLES | OF_ABSORBERS
+_STORED_VARIABLES = [name for name in _VARIABLES if name in Record.__annotations__]
 
 
 def record_from_xarray(dataset: "xarray.Dataset") -> Record:
@@ -35,17 +43,18 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     if "case" not in dataset.attrs:
         raise ValueError("not a record of jaxbeam: it lacks its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
-    # Without sensors or loads a file lacks their variables.
+    # Without sensors, loads or absorbers a file lacks their variables.
     sizes = {
         "sensor": len(case.sensors),
         "load": load_set(case).wheel_count,
         "actuator": len(case.actuators),
+        "absorber": len(case.absorbers),
         **dataset.sizes,
     }
     may_be_empty = *_STORED_VARIABLES, "measured"
-    shapes = {name: [sizes.get(d, 0) for d in VARIABLES[name][0]] for name in may_be_empty}
+    shapes = {name: [sizes.get(d, 0) for d in _VARIABLES[name][0]] for name in may_be_empty}
     empty = {
-        name: (VARIABLES[name][0], np.zeros(shape))
+        name: (_VARIABLES[name][0], np.zeros(shape))
         for name, shape in shapes.items()
         if 0 in shape and name not in dataset.variables
     }

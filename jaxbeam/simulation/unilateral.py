@@ -48,7 +48,7 @@ from jaxbeam.model.contact import ContactState, initial_vehicle_states, split_st
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import sensor_history
-from jaxbeam.model.sensor_signals import VehicleMotion
+from jaxbeam.model.sensor_signals import VehicleMotion, relative_to_beam
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.simulation.integration_plan import IntegrationPlan
 from jaxbeam.simulation.labels import Flights
@@ -465,6 +465,13 @@ def motion_at_samples(
     on_beam = np.asarray(loads.on_beam(times)).T
     at = instants(model, loads, times, on_beam)
     force = at.forces(law, pressing, states, heights)
+    return _motion(case, model, loads, law, at, times, on_beam, states, heights, force)
+
+
+def _motion(
+    case: Case, model: ModalModel, loads: LoadSet, law, at, times, on_beam, states, heights, force
+) -> tuple[Motion, VehicleMotion]:
+    """Motion of beam and vehicles at times (s), under contact forces (time, wheel) in N."""
     excess = np.where(law.contact, force, 0.0) - at.weight
     vehicles = loads.vehicle_states
     rates = (heights @ law.A.T + excess @ law.B.T)[:, :vehicles, None]
@@ -481,7 +488,11 @@ def motion_at_samples(
 def peaks_of_run(
     case: Case, model: ModalModel, loads: LoadSet, run: UnilateralRun, sensors: Sequence[Sensor]
 ) -> RunningPeaks:
-    """Peaks of what sensors measure, upwards, then downwards, and the contact forces of a run."""
+    """Peaks of what sensors measure, upwards, then downwards, and the contact forces of a run.
+
+    The last of the sensors are at the absorbers, twice, in whose place peaks are those of strokes
+    (m) and then of forces (N).
+    """
     pieces: dict[str, Any] = {
         name: np.stack([getattr(piece, name) for piece in run.pieces])
         for name in ("start", "length", "on_beam", "pressing", "force", "states", "heights")
@@ -512,6 +523,11 @@ def peaks_of_run(
     peaks = initial_peaks(2 * len(sensors), wheels, 1, lambda value: value)
     if sensors:
         values = [np.asarray(sensor_history(case, model.modes, motion, one)) for one in sensors]
+        if absorbers := len(case.absorbers):
+            at_points = at, times, here, states, heights, force
+            _, vehicles = _motion(case, model, loads, run.law, *at_points)
+            stroke = relative_to_beam(case, model.modes, vehicles.body_displacement, coordinates)
+            values[-2 * absorbers :] = [*np.asarray(stroke).T, *force[:, -absorbers:].T]
         samples = np.stack([*values, *(-value for value in values)], axis=1)
         samples = samples.reshape(count, POINTS.size, -1, 1)
         peaks = peaks_of_steps(peaks, samples, start, length)

@@ -220,6 +220,9 @@ HELD_CASES = {
 }  # fmt: skip
 
 
+EXTREMES = "largest", "smallest", "lowest_contact_force", "peak_stroke", "peak_absorber_force"
+
+
 @pytest.mark.parametrize("parts", HELD_CASES.values(), ids=HELD_CASES)
 def test_without_flights_it_is_the_bilateral_run(parts):
     case = jb.Case(
@@ -238,11 +241,12 @@ def test_without_flights_it_is_the_bilateral_run(parts):
     for name in (
         "coordinates", "rates", "contact_force", "body_displacement", "body_acceleration",
         "largest", "smallest", "peak_deflection", "lowest_contact_force", "stroke",
+        "peak_stroke", "peak_absorber_force",
     ):  # fmt: skip
         one, other = (np.asarray(getattr(run, name)) for run in (record, bilateral))
         largest = np.nanmax(np.abs(other), initial=0.0)
         # Extremes are those of polynomials through the points of steps, which differ.
-        rounding = 2e-7 if name in ("largest", "smallest", "lowest_contact_force") else 2e-9
+        rounding = 2e-7 if name in EXTREMES else 2e-9
         assert_allclose(one, other, atol=rounding * largest, rtol=1e-12, err_msg=name)
     assert record.verdict.split(";")[0] == bilateral.verdict.split(";")[0]
 

@@ -121,8 +121,7 @@ def _absorber_lines(record: "jb.Record") -> list[str]:
     absorbers = record.case.absorbers
     if not absorbers:
         return []
-    largest = [abs(part).max(axis=0) for part in (record.stroke, record.absorber_force)]
-    columns = (*largest, record.absorber_energy[-1])
+    columns = record.peak_stroke, record.peak_absorber_force, record.absorber_energy[-1]
     rows = [
         (str(i), f"{absorber.position:.4g}", *(f"{column[i]:.6g}" for column in columns))
         for i, absorber in enumerate(absorbers)
