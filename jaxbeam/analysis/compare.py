@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
+from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound, no_bound
 from jaxbeam.analysis.stability import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, refuses_traced
+from jaxbeam.control.feedforward import without_control
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Module
 from jaxbeam.runtime.printer import TableViews
@@ -114,8 +115,9 @@ class PerformanceMetrics(NamedTuple):
     (m) over the samples of the run, `after_exit` (m) the largest after the last load has left, NaN
     if the run ends before. For each actuator `effort` is the integral of the squared command over
     the run (command^2 s), `saturated` the fraction of samples at a limit. `share` is the fraction
-    of the attainable reduction of the peak (see `Bound.share`), `stability_margin` the margin along
-    the crossing, `limit_cycles` the oscillation of each command.
+    of the attainable reduction of the peak (see `Bound.share`), NaN without a bound,
+    `stability_margin` the margin along the crossing, `limit_cycles` the oscillation of each
+    command.
     """
 
     peak: float
@@ -132,19 +134,26 @@ class Comparison(TableViews, Module):
     """Result of `compare`: records and metrics of the controllers by name, and the bound.
 
     `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.
+    Both of the bound are None where limits of a voltage allow none (see `jaxbeam.bound`).
     """
 
     case: Case
     uncontrolled: Record
-    optimal: Record
+    optimal: Record | None
     records: dict[str, Record]
     metrics: dict[str, PerformanceMetrics]
-    bound: Bound
+    bound: Bound | None
 
     @property
     def headline(self) -> str:
-        """Peaks without control and under the bound, in one sentence."""
-        return self.bound.verdict
+        """Peaks without control and under the bound, in one sentence, or why there is no bound."""
+        if self.bound is not None:
+            return self.bound.verdict
+        return (
+            f"largest deflection without control {np.max(self.uncontrolled.peak_deflection):.4g} m;"
+            f" no least achievable peak, as {no_bound(self.case)}; times at limits are those of"
+            " commands, not of voltages"
+        )
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -210,7 +219,8 @@ def compare(
     """Simulate a case under controllers, without control, and with the commands of its bound.
 
     The bound is that of commands held over `period` (s), by default the shortest period of the
-    controllers, or 0.01 s, starting at its multiples. A controller of the case itself is left out
+    controllers, or 0.01 s, starting at its multiples; it is left out where limits of a voltage
+    within an inner loop allow none. A controller of the case itself is left out
     unless it is given too. Contact loss is in the verdicts of the records; there is no warning.
 
     Raises ValueError without controllers, for a case that is invalid with one of them (which it
@@ -218,16 +228,18 @@ def compare(
     """
     if not controllers:
         raise ValueError("there is nothing to compare: give at least one controller")
-    uncontrolled_case = dataclasses.replace(case, controller=None)
+    uncontrolled_case = without_control(case)
     periods = [float(c.period) for c in controllers.values() if c.period is not None]
     period = min(periods, default=DEFAULT_PERIOD) if period is None else period
-    least_peak = bound(uncontrolled_case, period=period)
+    least_peak = None if no_bound(case) else bound(uncontrolled_case, period=period)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         uncontrolled = simulate(uncontrolled_case)
         records = {name: _simulate_with(case, name, one) for name, one in controllers.items()}
-        exact_case = with_exact_compensation(case)  # commands of the bound are those that act
-        optimal = _simulate_with(exact_case, "the bound", least_peak.controller())
+        optimal = None
+        if least_peak is not None:
+            exact_case = with_exact_compensation(case)  # commands of the bound are those that act
+            optimal = _simulate_with(exact_case, "the bound", least_peak.controller())
     metrics = {
         name: performance_metrics(record, uncontrolled, least_peak)
         for name, record in records.items()
@@ -240,7 +252,7 @@ class MetricsOverCases(NamedTuple):
 
     `peak` (m), `after_exit` (m, NaN if a run ends before the last exit) and `saturated` (fraction
     of a run that an actuator is at a limit) are the largest of all cases, `worst_share` and
-    `mean_share` the least and the mean fraction of the attainable reduction.
+    `mean_share` the least and the mean fraction of the attainable reduction, NaN without bounds.
     """
 
     peak: float
@@ -271,9 +283,12 @@ def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOv
 def worst_comparison(comparisons: Sequence[Comparison], name: str) -> int:
     """Index of the comparison in which a controller achieves the least of the attainable reduction.
 
-    Divergence is less than any; runs in which nothing can be attained count last.
+    Divergence is less than any; runs in which nothing can be attained count last. Without any share
+    it is that of the largest peak.
     """
     metrics = [comparison.metrics[name] for comparison in comparisons]
+    if all(np.isnan(one.share) for one in metrics):
+        return int(np.argmax(np.nan_to_num([one.peak for one in metrics], nan=np.inf)))
     shares = [-np.inf if np.isnan(one.peak) else one.share for one in metrics]
     return int(np.argmin(np.nan_to_num(shares, nan=np.inf, neginf=-np.inf)))
 
@@ -286,9 +301,9 @@ def _simulate_with(case: Case, name: str, controller: AbstractController) -> Rec
 
 
 def performance_metrics(
-    record: Record, uncontrolled: Record, least_peak: Bound
+    record: Record, uncontrolled: Record, least_peak: Bound | None
 ) -> PerformanceMetrics:
-    """Metrics of a run, given the uncontrolled run and the bound of its case."""
+    """Metrics of a run, given the uncontrolled run and the bound of its case, if it has one."""
     deflection, times = np.asarray(record.deflection), np.asarray(record.times)
     after_exit = np.abs(deflection[times > crossing_times(record.case)[:, 1].max()])
     return PerformanceMetrics(
@@ -297,7 +312,7 @@ def performance_metrics(
         after_exit=float(after_exit.max()) if after_exit.size else np.nan,
         effort=np.asarray(record.effort),
         saturated=np.asarray(record.saturated).mean(axis=0),
-        share=least_peak.share(record),
+        share=np.nan if least_peak is None else least_peak.share(record),
         stability_margin=stability_margin(record.case),
         limit_cycles=command_oscillations(record, uncontrolled),
     )
@@ -451,7 +466,7 @@ def compare_under_faults(
     """
     if not controllers:
         raise ValueError("there is nothing to compare: give at least one controller")
-    free = dataclasses.replace(case, controller=None)
+    free = without_control(case)
     periods = [float(concrete(c.period)) for c in controllers.values() if c.period is not None]
     period = min(periods, default=DEFAULT_PERIOD) if period is None else period
     with warnings.catch_warnings():

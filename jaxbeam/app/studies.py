@@ -277,7 +277,9 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
     from jaxbeam.analysis.compare import compare as compare_controllers
 
     found = compare_controllers(case, dict(controllers))
-    records = {"without": found.uncontrolled, **found.records, "bound": found.optimal}
+    records = {"without": found.uncontrolled, **found.records}
+    if found.optimal is not None:
+        records["bound"] = found.optimal
     rows = []
     for name, metrics in found.metrics.items():
         rows.append(
@@ -304,7 +306,7 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "rows": rows,
         "uncontrolled": uncontrolled,
-        "bound": float(np.max(found.optimal.peak_deflection)),
+        "bound": found.optimal and float(np.max(found.optimal.peak_deflection)),
         "runs": runs,
         "unit": next((one.command_unit for one in case.driven), ""),
     }

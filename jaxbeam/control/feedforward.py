@@ -6,6 +6,7 @@ heavy load too: the schedule needs the position of the load, not its mass.
 A table drawn by hand, from statics alone, is the baseline with which other laws are compared.
 """
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import (
     AbstractController,
@@ -34,6 +36,16 @@ from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER, SAME_FRACTION, SAME_SAMPLE, SAME_TIME, has_come
 from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.runtime.arrays import Array, Number, xp
+
+
+def without_control(case: Case) -> Case:
+    """The case without its controller.
+
+    It has commands of zero where a shaker's voltage has limits within an inner loop, which has no
+    run without a controller (see `jaxbeam.case.validation.check_case`).
+    """
+    none = Prescribed(offsets=np.zeros(len(case.driven))) if limited_loops(case.actuators) else None
+    return dataclasses.replace(case, controller=none)
 
 
 class Prescribed(AbstractStaticController):

@@ -226,7 +226,7 @@ def _styled_runs(comparison: Comparison):
     return [
         ("no control", comparison.uncontrolled, UNCONTROLLED_STYLE),
         *controlled_runs,
-        ("optimal commands", comparison.optimal, OPTIMAL_STYLE),
+        *([("optimal commands", comparison.optimal, OPTIMAL_STYLE)] if comparison.bound else []),
     ]
 
 
@@ -245,12 +245,13 @@ def _draw_deflection(axes, comparison: Comparison):
             labels.append(f"{name} diverges")
             continue
         peaks.append(signed_peak(record, sensor) / factor)
-        share = f" ({metrics[name].share:.0%})" if name in metrics else ""
+        share = f" ({metrics[name].share:.0%})" if name in metrics and comparison.bound else ""
         labels.append(f"{name} {format_number(peaks[-1])} {unit}{share}")
         when = float(record.peak_time[sensor])
         axes.plot([when], peaks[-1:], "o", color=look["color"], markeredgecolor="white", zorder=3)
     low, high = min(*peaks, 0.0), max(*peaks, 0.0)
-    for bound in (-comparison.bound.peak / factor, comparison.bound.peak / factor):
+    least = comparison.bound.peak / factor if comparison.bound else np.nan
+    for bound in (-least, least):
         if low <= bound <= high:
             axes.axhline(bound, color=INK, linewidth=0.7)
     position = float(concrete(comparison.case.sensors[sensor].position))

@@ -22,6 +22,7 @@ from jaxbeam.analysis.stability import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison
+from tests.case.test_actuators import LOOPS, PERIOD, by_its_equations, crossing, shaker
 from tests.loop_as_oracle import span_of
 from tests.plot.figures import words
 
@@ -281,3 +282,27 @@ def test_the_worst_run_is_the_one_that_is_named(peaks, shares, worst, least):
         comparisons.append(comparison)
     assert worst_comparison(comparisons, "law") == worst
     assert_allclose(metrics_over_cases(comparisons)["law"].worst_share, least)
+
+
+def test_limits_of_a_voltage_leave_the_bound_out(tmp_path, monkeypatch, capsys):
+    """The run without control by scipy: the loop keeps the current at zero as far as it can."""
+    limits, law = [-0.2, 0.3], jb.Feedback([1e3], period=PERIOD)
+    case = crossing(shaker(LOOPS["current"], limits=limits), controller=law)
+    found = compare(case, {"law": law})
+    times = np.asarray(found.uncontrolled.times)
+    expected, *_ = by_its_equations(LOOPS["current"], times, 0.0, limits)
+    deflection = found.uncontrolled.deflection[:, 0]
+    assert_allclose(deflection, expected, atol=1e-6 * np.abs(expected).max())
+    assert found.metrics["law"].peak == jb.simulate(case).peak_deflection[0]
+    assert found.bound is None and found.optimal is None
+    assert "no least achievable peak, as actuators.0.limits bound the voltage" in found.headline
+    assert "optimal commands" not in words(plot_comparison(found))
+    jb.save_case(case, tmp_path / "case.toml")
+    code, shown, _ = run("compare case.toml", tmp_path, monkeypatch, capsys)
+    assert code == 0
+    assert found.headline in shown and f"{found.metrics['law'].peak:.6g}" in shown
+    _, shown, _ = run("compare case.toml --json", tmp_path, monkeypatch, capsys)
+    assert json.loads(shown)["least_peak"] is None
+    light = compare(jb.replace(case, {"loads.0.mass": 0.05}), {"law": law})
+    assert light.metrics["law"].peak < found.metrics["law"].peak
+    assert worst_comparison([light, found], "law") == 1

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
+from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak, no_bound
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.case.fields import refuses_traced
+from jaxbeam.control.feedforward import without_control
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
@@ -215,8 +216,8 @@ def make_run_set(
     """Run set of a case; the runs are simulated once without control.
 
     `positions` (m) are where deflections count, those of the sensors if left out. With
-    `least_peaks` the least achievable peak of each run is computed. `quantities` of sensors are
-    metrics.
+    `least_peaks` the least achievable peak of each run is computed, unless limits of a voltage
+    allow none (see `jaxbeam.bound`). `quantities` of sensors are metrics.
 
     Raises ValueError for an unknown address, a faulty run or one that ends too early, and for a
     case without controller and absorbers, without positions, or without a sensor of one of the
@@ -244,7 +245,7 @@ def make_run_set(
         plan_future = pool.submit(_integration_plan, cases)
         wanted = times, positions, tuple(quantities)
         uncontrolled_future = pool.submit(_uncontrolled_histories, cases, *wanted)
-        bounded = least_peaks and case.controller is not None
+        bounded = least_peaks and case.controller is not None and not no_bound(case)
         least_future = pool.submit(_least_peaks, cases, positions) if bounded else None
     plan = plan_future.result()
     uncontrolled = uncontrolled_future.result()
@@ -279,7 +280,7 @@ def uncontrolled(case: Case) -> Case:
     """The case without its controller; without its absorbers, if it has no controller."""
     if case.controller is None:
         return dataclasses.replace(case, absorbers=())
-    return dataclasses.replace(case, controller=None)
+    return without_control(case)
 
 
 def _integration_plan(cases: list[Case]) -> IntegrationPlan:

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.analysis.bound.bound import no_bound
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files.case_file import case_to_dict
@@ -68,7 +69,7 @@ def tune(
     constraint on the poles along the crossings (points that violate it are the result only where
     no other was met, which the result says). A `penalty`, a differentiable function of the values
     by address, is added to the objective. With `least_peaks` the least achievable peak of each run
-    is computed.
+    is computed, unless limits of a voltage within an inner loop allow none.
 
     The `method` is "adam" or "lbfgs" (optax) or "bfgs" (optimistix); each step simulates all runs
     once or, with a `batch` (Adam only), so many of them, drawn by the `seed`.
@@ -174,6 +175,12 @@ class TuningProblem:
         least_peaks: bool = True,
         penalty: Callable | None = None,
     ):
+        obstacle = no_bound(case)
+        if obstacle and "shortfall" in objective.weights | objective.limits:
+            raise ValueError(
+                f"shortfall is relative to the least achievable peaks, but {obstacle}: tune for"
+                " peak in its place"
+            )
         self.case, self.cases, self.objective = case, cases, objective
         self.positions, self.least_peaks, self.penalty = positions, least_peaks, penalty
         self.parameters = free_parameters([case], dict(free), 1.0)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.analysis.bound.bound import no_bound
 from jaxbeam.analysis.compare import Comparison, compare
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.controller import AbstractController
@@ -137,6 +138,8 @@ class TuningResult(TableViews):
                 f"; of the attainable reduction at least {shares.min():.1%},"
                 f" {shares.mean():.1%} in the mean"
             )
+        elif obstacle := no_bound(self.case):
+            sentence += f"; no least achievable peaks, as {obstacle}"
         if self.stability_violation > 0:
             sentence += (
                 "; the stability constraint is violated: the real part of a pole is"

@@ -526,6 +526,16 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     )
 
 
+def no_bound(case: Case) -> str:
+    """Why a case has no bound, in a clause; empty if none of its actuators is the reason."""
+    if limited := limited_loops(case.actuators):
+        return (
+            f"actuators.{limited[0]}.limits bound the voltage within its inner loop, and a bound is"
+            " that of a linear plant"
+        )
+    return ""
+
+
 def checked_influence(
     case: Case, positions: ArrayLike | None, period: float | None, spacing: float | None
 ) -> tuple[InputInfluence, Float[np.ndarray, " position"], float, float]:
@@ -533,11 +543,8 @@ def checked_influence(
 
     Raises ValueError as `bound`.
     """
-    if limited := limited_loops(case.actuators):
-        raise ValueError(
-            f"actuators.{limited[0]}.limits bound the voltage within its inner loop, and a bound is"
-            " that of a linear plant: leave them out"
-        )
+    if obstacle := no_bound(case):
+        raise ValueError(f"{obstacle}: leave them out")
     check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (

@@ -203,7 +203,11 @@ def _read_controllers(path: Path, case: "jb.Case", files: tuple[Path, ...]) -> d
 
 def _to_dict(comparison: "Comparison") -> dict:
     """Numbers of a comparison by their names in JSON (SI units)."""
-    return _bound_to_dict(comparison.bound) | {
+    import numpy as np
+
+    without = float(np.max(comparison.uncontrolled.peak_deflection))
+    none = {"uncontrolled_peak": without, "least_peak": None, "held_for": None}
+    return (_bound_to_dict(comparison.bound) if comparison.bound else none) | {
         "controllers": {
             name: _metrics_to_dict(metrics)
             | {
@@ -275,7 +279,7 @@ def _lines(comparison: "Comparison") -> list[str]:
             (
                 name,
                 f"{metrics.peak:.6g}",
-                f"{metrics.share:.1%}",
+                f"{metrics.share:.1%}" if comparison.bound else "-",
                 f"{metrics.rms:.4g}",
                 f"{metrics.after_exit:.4g}",
                 " ".join(f"{effort:.4g}" for effort in metrics.effort),
@@ -320,8 +324,10 @@ def _overall_table(overall: "dict[str, MetricsOverCases]") -> list[str]:
             (
                 name,
                 f"{metrics.peak:.6g}",
-                f"{metrics.worst_share:.1%}",
-                f"{metrics.mean_share:.1%}",
+                *(
+                    "-" if math.isnan(share) and math.isfinite(metrics.peak) else f"{share:.1%}"
+                    for share in (metrics.worst_share, metrics.mean_share)
+                ),
                 f"{metrics.after_exit:.4g}",
                 f"{metrics.saturated:.1%}",
             )

@@ -10,7 +10,9 @@ import scipy.optimize
 
 import jaxbeam as jb
 import tuning
+from jaxbeam.analysis.sections import coil_history
 from jaxbeam.analysis.stability import frozen_poles
+from tests.case.test_actuators import LOOPS as INNER_LOOPS, PERIOD, crossing, shaker
 from tests.differences import central
 from tuning import checkpoint
 from tuning.checkpoint import load, save
@@ -453,3 +455,35 @@ def test_gradients_of_a_bending_moment():
     np.testing.assert_allclose(slope, (above - below) / 20, rtol=1e-5)
     with pytest.raises(ValueError, match="'shear' is the largest shear at the sensors"):
         make_run_set(case, GRADIENT_RUNS, quantities=("shear",))
+
+
+def test_through_limits_of_a_voltage():
+    """Where the voltage saturates: the objective, its gradient, and the result without bounds."""
+    actuator = shaker(INNER_LOOPS["current"], limits=[-0.2, 0.3])
+    case = crossing(actuator, controller=jb.Feedback([1e3], period=PERIOD))
+    runs = tuning.LoadCases(({"loads.0.mass": 0.08}, {"loads.0.mass": 0.12}))
+    run_set = make_run_set(case, runs.training, least_peaks=True)
+    objective = Objective({"peak": 1.0, "rms": 0.3}, "mean")
+
+    @jax.jit
+    def value(gain):
+        metrics = run_set.metrics({GAIN: gain}, 40.0)
+        return objective.aggregate(objective.weighted_metrics(metrics), 40.0)
+
+    for gain in (600.0, 1500.0):
+        assert np.isin([-0.2, 0.3], coil_history(jb.replace(case, {GAIN: gain})).voltage).any()
+        # Steps within which no further point of a time step reaches a limit.
+        expected = central(lambda point: value(point[0]), [gain], step=1e-4)[0]
+        assert jax.jit(jax.grad(value))(gain) == pytest.approx(expected, rel=1e-6)
+    free = {GAIN: (100.0, 5000.0)}
+    found = tuning.tune(case, free, runs, objective, steps=12, progress=False)
+    assert "no least achievable peaks, as actuators.0.limits bound the voltage" in found.verdict
+    before, after = found.run_sets[0].objective
+    gains = np.linspace(100.0, 2000.0, 39)
+    true = jax.jit(
+        lambda gain: objective.aggregate(objective.weighted_metrics(run_set.metrics({GAIN: gain})))
+    )
+    least = min(float(true(gain)) for gain in gains)
+    assert after < before and after < least * 1.01
+    with pytest.raises(ValueError, match="relative to the least achievable peaks, but"):
+        tuning.tune(case, free, runs, Objective({"shortfall": 1.0}), progress=False)
