@@ -1,4 +1,5 @@
 from .animation import animate as animate
+from .comparison import plot_comparison as plot_comparison
 from .drawing import plot_vehicles as plot_vehicles
 from .engineering import (
     plot_assessment as plot_assessment,
@@ -11,7 +12,7 @@ from .modes import (
     plot_modes as plot_modes,
     plot_poles as plot_poles,
 )
-from .record import plot_comparison as plot_comparison, plot_record as plot_record
+from .record import plot_record as plot_record
 from .sweep import plot_realisations as plot_realisations, plot_sweep as plot_sweep
 from .tuning import (
     FitPanel as FitPanel,
