@@ -20,6 +20,7 @@ MAX_COUNTS = {
     "supports": 1000,
     "absorbers": 200,
     "actuators": 200,
+    "active": 200,  # of them
     "sensors": 10_000,
     "vehicle_sensors": 10_000,
     "loads": 5000,
