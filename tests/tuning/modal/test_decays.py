@@ -14,6 +14,7 @@ from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
     free_decays,
+    or_most_informative,
     stacked,
     until_soft_impact,
 )
@@ -445,3 +446,19 @@ def test_marks_of_an_impact_and_its_rebounds_are_one():
         marks[start:stop] = True
     found = marked_impacts((marks,), 100.0, (1.0, 20.0))
     assert found == (Impact(0, 404), Impact(0, 2004))  # what lasts for seconds is no impact
+
+
+def test_decays_that_are_left_tell_more_than_that_of_the_hardest_impact():
+    """Each alone, by energy above noise times nepers: a hundred times as much after the first."""
+    samples, _ = two_impacts()
+    first, second = (Stretch(0, start, start + 250, 2.0) for start in (302, 602))
+    slow = second._replace(fall=1e4)  # nepers
+    for rest, impacts, expected in (
+        ((second,), (first, second), (first,)),
+        ((second,), (second,), (second,)),  # something may act in the first
+        ((second,), (), (second,)),
+        ((first, second), (first, second), (first, second)),
+        ((slow,), (first, slow), (slow,)),
+    ):
+        found = or_most_informative(rest, impacts, samples.records, 1.0, 25.0)
+        assert found == expected

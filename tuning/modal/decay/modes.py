@@ -32,6 +32,7 @@ from tuning.modal.decay.stretches import (
     dominate,
     excited_samples,
     free_decays,
+    or_most_informative,
     stacked,
     until_soft_impact,
 )
@@ -230,15 +231,22 @@ def free_decay_modes(
         return None
     if all(one.from_rest for one in decays):
         return _of_fit(_of_best_length(one, samples, derivatives, band, order), samples)
+
+    hit = tuple(one for one in decays if after_impact(one, excited[one.record], cycle))
+
+    def rest_of(fitted: _Fitted) -> tuple[Stretch, ...]:
+        rest = _rest(fitted, samples, excited, band, cycle)
+        return or_most_informative(rest, hit, prepared.records, ratio, prepared.rate / frequency)
+
     for _ in range(MAX_CUTS):
-        rest = one.used if given else _rest(one, samples, excited, band, cycle)
+        rest = one.used if given else rest_of(one)
         if rest == one.used:
             break
         one = _fitted(rest, samples, derivatives, band, order)
         if one is None:
             return None
     else:
-        if kind is None and _rest(one, samples, excited, band, cycle) != one.used:
+        if kind is None and rest_of(one) != one.used:
             return None
     if given or after_soft_impacts(decays, excited):
         most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_IMPACTS

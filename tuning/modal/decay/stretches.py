@@ -285,18 +285,41 @@ def _falls_at_once(energy) -> bool:
 
 
 def _tell_enough(decays, own: Stretch, marks, energy) -> bool:
-    """Whether decays have enough information compared with the decay right after an impact.
+    """Whether decays have enough information compared with the decay right after an impact."""
+    ratio = len(energy) / marks.size
+    least = LEAST_INFORMATION * _information_of(own, energy, ratio)
+    return sum(_information_of(one, energy, ratio) for one in decays) > least
 
-    Information is energy times nepers; the energy is that above the noise, the usual energy of the
-    record.
+
+def _information_of(one: Stretch, energy, ratio: float) -> float:
+    """Information of a decay: its nepers times the energy above the noise, the usual energy.
+
+    `ratio` is that of the samples of the energy over those of the log.
     """
-    ratio, noise = marks.size / len(energy), np.median(energy)
+    part = energy[int(one.start * ratio) : int(one.stop * ratio)] - np.median(energy)
+    return float(one.fall * np.maximum(part, 0.0).sum())
+
+
+def or_most_informative(
+    rest: tuple[Stretch, ...],
+    impacts: tuple[Stretch, ...],
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    ratio: float,
+    cycle: float,
+) -> tuple[Stretch, ...]:
+    """The `rest` of some decays, or that after an impact which has more information alone.
+
+    Nothing acts in decays after `impacts`: what a fit does not explain there is nonlinearity.
+    `records` are those of the band, `ratio` their samples over those of the log, `cycle` that of
+    the strongest vibration in samples of `records`.
+    """
+    energies = [vibration_energy(record, max(int(2 * cycle), 4)) for record in records]
 
     def information(one):
-        part = energy[int(one.start / ratio) : int(one.stop / ratio)] - noise
-        return one.fall * np.maximum(part, 0.0).sum()
+        return _information_of(one, energies[one.record], ratio)
 
-    return bool(sum(map(information, decays)) > LEAST_INFORMATION * information(own))
+    best = tuple(sorted(impacts, key=information)[-1:])
+    return max(rest, best, key=lambda some: sum(map(information, some)))
 
 
 def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
