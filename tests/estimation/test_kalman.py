@@ -234,6 +234,37 @@ def test_an_acceleration_that_is_that_of_the_command_tells_nothing():
     assert_allclose(estimate.state, predicted[:4], rtol=1e-6, atol=1e-15)
 
 
+def test_accelerations_under_a_followed_mass():
+    """One update with (1 + m phi phi^T) q'' of each mode, differenced by the load's numbers."""
+    sensors = [jb.Sensor(0.17), jb.Sensor(0.35, "acceleration")]
+    case = dataclasses.replace(
+        crossing(jb.MovingMass(mass=0.4, speed=2.0, entry_time=-0.1)), sensors=sensors
+    )
+    plant, command, t = jb.state_space(case), np.array([30.0]), np.asarray(0.0)
+    filter = FOLLOWS.sampled_filter(plant, sample_timing(case.controller))
+    start = filter.initial_state()
+    x, covariance = (np.asarray(part) for part in filter.predict(start, command, t))
+    n, w = np.arange(1, 3) * np.pi / LENGTH, (np.arange(1, 3) * np.pi / LENGTH) ** 2
+    w = w * (11.68 / 0.535) ** 0.5
+
+    def fields(position):
+        sine, cosine = np.sin(n * position), np.cos(n * position)
+        return (2 / (0.535 * LENGTH)) ** 0.5 * np.array([sine, n * cosine, -(n**2) * sine])
+
+    def read(x):
+        (shape, slope, bend), speed, mass = fields(x[4]), x[5], x[6]
+        forces = 30.0 * fields(0.4)[0] - 0.06 * w * x[2:4] - w**2 * x[:2]
+        forces -= shape * mass * (9.81 + 2 * speed * slope @ x[2:4] + speed**2 * bend @ x[:2])
+        accelerations = np.linalg.solve(np.eye(2) + mass * np.outer(shape, shape), forces)
+        return np.array([fields(0.17)[0] @ x[:2], fields(0.35)[0] @ accelerations])
+
+    rows, innovation = central(read, x, 1e-6), np.array([2e-5, 0.3])
+    noise = np.diag(np.full(2, FOLLOWS.measurement_noise) ** 2)
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise)
+    _, found = filter.update(start, Measurement(read(x) + innovation, np.zeros(4), command), t)
+    assert_allclose(found.x - x, gain @ innovation, rtol=1e-5, atol=1e-12)
+
+
 def deflections_by_scipy(case):
     return expected(case, np.arange(0.0, float(case.run.duration), EXTENDED_PERIOD)).deflection
 
