@@ -115,14 +115,16 @@ def sample_schedule(
 ) -> EventSchedule:
     """Schedule of a run without controller: samples at ascending times (s), which may be traced.
 
-    The first `lead_samples` times are events without a sample, and so is the `end` (s) of the run,
-    if it is not the last sample.
+    The first `lead_samples` times, from 0 in equal steps, are events without a sample, and so is
+    the `end` (s) of the run, if it is not the last sample.
     """
     count = times.shape[0]
     sample_events = xp.arange(lead_samples, count)
     if equally_spaced:
-        lengths = ((times[-1] - times[0]) / (count - 1))[None]
-        length_index = xp.zeros(count - 1, int)
+        first = times[lead_samples]
+        both = (times[-1] - first) / (count - 1 - lead_samples), first / max(lead_samples, 1)
+        lengths = xp.stack(both[: 2 if lead_samples else 1])
+        length_index = xp.asarray(np.arange(count - 1) < lead_samples, int)
     else:
         lengths, length_index = xp.diff(times), xp.arange(count - 1)
     if end is not None:

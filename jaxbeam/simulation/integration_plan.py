@@ -203,6 +203,7 @@ AMPLIFICATION = 1e4
 # change sharply, errors were up to fourteen times as large with steps that begin elsewhere.
 TRIAL_STEP_FRACTION = 0.8
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
+MAX_LEAD = 1000  # largest number of steps before the first sample, if there are fewer samples
 
 
 class IntegrationPlan(Module):
@@ -288,13 +289,15 @@ def integration_plan(
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
     )
-    lead_samples = int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE))
+    needed = int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE))
+    lead_samples = min(needed, max(samples.size, MAX_LEAD))
     schedule = run_schedule(case, samples, equally_spaced, lead_samples, to_duration)
     step, error, trial = choose_step_size(case, shapes, tolerance, schedule)
     substeps, error_ratio = trial.substeps, 1.0
     if not substeps:
-        substeps, error_ratio = _substeps_and_error_ratio(trial, step, intervals.max())
-        check_step_count(float(samples.size * substeps), intervals.max() / substeps)
+        longest = max(intervals.max(), samples[0] / max(lead_samples, 1))
+        substeps, error_ratio = _substeps_and_error_ratio(trial, step, longest)
+        check_step_count(float((lead_samples + samples.size) * substeps), longest / substeps)
     return IntegrationPlan(
         shapes,
         substeps,
@@ -372,11 +375,10 @@ def run_schedule(
 ) -> EventSchedule:
     """Schedule of a run without controller that is sampled at ascending times (s).
 
-    From rest at t = 0 to the first sample in steps as those between samples; the run ends with the
-    last, or `to_duration` at that of the case.
+    From rest at t = 0 to the first sample in so many equal steps; the run ends with the last
+    sample, or `to_duration` at that of the case.
     """
-    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-    lead_times = times[0] - spacing * xp.arange(lead_samples, 0, -1)
+    lead_times = times[0] * (np.arange(lead_samples) / max(lead_samples, 1))
     all_times = xp.concatenate([lead_times, times])
     end = case.run.duration if to_duration else None
     return sample_schedule(all_times, equally_spaced, lead_samples, end)
