@@ -339,3 +339,18 @@ def test_errors_of_close_samples_are_stated():
     record, rare = (jb.simulate(replace(case, {"run.sample_rate": rate})) for rate in (1000, 20))
     assert 0 < record.error_estimate < 1e-7
     assert_allclose(record.peak_deflection, rare.peak_deflection, rtol=1e-7)
+
+
+@pytest.mark.parametrize("hinge", [0.4, 0.35])
+def test_a_run_that_ends_at_a_kink_ends_behind_it(hinge):
+    """Momentum: (1 + m s s^T) q' there is what the finite forces of the last instant left of it."""
+    end = hinge / 0.7
+    beam = dataclasses.replace(HINGED, hinges=[jb.Hinge(hinge, 0.5)])
+    case = jb.Case(beam, loads=[mass(0.4, speed=0.7)], run=jb.Run(end))
+    record = jb.simulate(case, np.array([end - 1e-9, end]))
+    (before, after), q = record.motion.rates, record.coordinates[-1]
+    left, right = (record.modes.shapes(hinge + side * 1e-9, 1) for side in (-1, 1))
+    shape = record.modes.shapes(hinge)
+    impulse = 0.4 * shape * (shape @ (before - after) + 0.7 * (left - right) @ q)
+    assert_allclose(after - before, impulse, rtol=0, atol=1e-6 * np.abs(before).max())
+    assert np.abs(after - before).max() > 1e-2 * np.abs(before).max()
