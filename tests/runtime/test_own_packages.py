@@ -74,6 +74,7 @@ for name in ("getuid", "geteuid", "getgid", "fchmod", "fchown", "sched_getaffini
              "setsid", "O_NOFOLLOW", "O_DIRECTORY", "O_NONBLOCK", "mkfifo"):
     if hasattr(os, name):
         delattr(os, name)
+os.process_cpu_count = os.cpu_count  # of Python 3.13, as where there is no sched_getaffinity
 for name in ("SIGKILL", "SIGHUP", "SIGALRM", "pthread_sigmask", "setitimer", "pthread_kill"):
     if hasattr(signal, name):
         delattr(signal, name)
