@@ -63,6 +63,7 @@ def test_a_foreign_module_is_named_in_one_sentence(folder):
 
 PROGRAM = """
 import os
+import shutil
 import signal
 import sys
 
@@ -75,6 +76,7 @@ for name in ("getuid", "geteuid", "getgid", "fchmod", "fchown", "sched_getaffini
     if hasattr(os, name):
         delattr(os, name)
 os.process_cpu_count = os.cpu_count  # of Python 3.13, as where there is no sched_getaffinity
+shutil._use_fd_functions = False  # as where there is no O_NONBLOCK
 for name in ("SIGKILL", "SIGHUP", "SIGALRM", "pthread_sigmask", "setitimer", "pthread_kill"):
     if hasattr(signal, name):
         delattr(signal, name)
