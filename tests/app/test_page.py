@@ -131,6 +131,7 @@ def test_parts_are_dragged_and_the_load_scrubs_the_run(page):
     page.get_by_label("time", exact=True).fill("200")
     page.wait_for_selector("body:not(.busy)")
     page.wait_for_timeout(500)  # the load is drawn anew after the support has moved
+    wait_for(lambda: page.locator(".part.load").bounding_box() is not None)
     load = page.locator(".part.load").bounding_box()
     page.mouse.move(load["x"] + load["width"] / 2, load["y"] + load["height"] / 2)
     page.mouse.down()
