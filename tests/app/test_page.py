@@ -243,8 +243,8 @@ def latencies(page, address, count=40):
 @pytest.mark.parametrize("case", ["a rig", "a road bridge with its truck"])
 def test_a_picture_follows_its_slider(page, case):
     if case != "a rig":
-        starter = ROOT / "jaxbeam/files/starters/road-bridge.toml"
-        write(page, starter.read_text(encoding="utf-8"))
+        bridge = ROOT / "examples/road_bridge/case.toml"  # three spans, a truck of five axles
+        write(page, bridge.read_text(encoding="utf-8"))
         page.locator(".vehicle .body").first.wait_for(state="attached")
     found = latencies(page, "loads.0.speed")
     print(f"median {found[len(found) // 2]:.0f} ms, 95 % {found[int(0.95 * len(found))]:.0f} ms")
