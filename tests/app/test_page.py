@@ -26,11 +26,12 @@ def text_of(page):
 
 
 def wait_for(condition, seconds=30):
-    """Wait until a condition holds."""
+    """Wait until a condition holds and return what it found."""
     end = time.monotonic() + seconds
-    while not condition():
+    while not (found := condition()):
         assert time.monotonic() < end, "it has not come true"
         time.sleep(0.05)
+    return found
 
 
 def write(page, text):
@@ -119,7 +120,7 @@ def test_undo_and_redo_return_the_text_to_the_byte(page):
 
 
 def test_parts_are_dragged_and_the_load_scrubs_the_run(page):
-    part = page.locator('[data-part="supports.0"]').bounding_box()
+    part = wait_for(page.locator('[data-part="supports.0"]').bounding_box)
     page.mouse.move(part["x"] + part["width"] / 2, part["y"] + part["height"] / 2)
     page.mouse.down()
     page.mouse.move(part["x"] + 120, part["y"] + 20, steps=4)
@@ -131,8 +132,7 @@ def test_parts_are_dragged_and_the_load_scrubs_the_run(page):
     page.get_by_label("time", exact=True).fill("200")
     page.wait_for_selector("body:not(.busy)")
     page.wait_for_timeout(500)  # the load is drawn anew after the support has moved
-    wait_for(lambda: page.locator(".part.load").bounding_box() is not None)
-    load = page.locator(".part.load").bounding_box()
+    load = wait_for(page.locator(".part.load").bounding_box)
     page.mouse.move(load["x"] + load["width"] / 2, load["y"] + load["height"] / 2)
     page.mouse.down()
     page.mouse.move(load["x"] + 200, load["y"] + 9, steps=4)
