@@ -258,6 +258,7 @@ MARGIN = {"verdict": None, "gain": None, "delay": None, "obstacle": None, "unsta
 MARGINS = [{"gain": None, "gain_down": None, "phase": None, "delay": None, "distance": None}]
 LIMIT_CYCLES = [{"extra": None, "frequency": None, "at_limits": None}]
 COMPARISON = {
+    "headline": None,
     "uncontrolled_peak": None,
     "least_peak": None,
     "held_for": None,

@@ -208,6 +208,7 @@ def _to_dict(comparison: "Comparison") -> dict:
     without = float(np.max(comparison.uncontrolled.peak_deflection))
     none = {"uncontrolled_peak": without, "least_peak": None, "held_for": None}
     return (_bound_to_dict(comparison.bound) if comparison.bound else none) | {
+        "headline": comparison.headline,
         "controllers": {
             name: _metrics_to_dict(metrics)
             | {
