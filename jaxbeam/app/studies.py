@@ -273,7 +273,10 @@ def modes(
 
 
 def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
-    """Metrics and runs of controllers, the run without control, and the least achievable peak."""
+    """Metrics and runs of controllers, the run without control, and the least achievable peak.
+
+    The headline says why where there is no least achievable peak.
+    """
     from jaxbeam.analysis.compare import compare as compare_controllers
 
     found = compare_controllers(case, dict(controllers))
@@ -304,9 +307,10 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
         }
     uncontrolled = float(np.max(found.uncontrolled.peak_deflection))
     return {
+        "headline": found.headline,
         "rows": rows,
         "uncontrolled": uncontrolled,
-        "bound": found.optimal and float(np.max(found.optimal.peak_deflection)),
+        "bound": found.bound and found.bound.peak,
         "runs": runs,
         "unit": next((one.command_unit for one in case.driven), ""),
     }

@@ -32,6 +32,45 @@ speed = "3.6 km/h"
 duration = 1.3
 sample_rate = 500.0
 """
+SHAKER = """# A shaker within an inner loop, whose voltage has limits: no peak can be proved the least.
+[beam]
+length = 0.6
+flexural_rigidity = 11.68
+mass_per_length = 0.535
+modes = 2
+
+[[actuators]]
+kind = "electrodynamic"
+position = 0.35
+resistance = 0.82
+inductance = 5e-3
+force_constant = 4.2
+back_emf = 3.9
+mass = 0.03
+stiffness = 900.0
+damping = 0.55
+limits = [-0.2, 0.3]
+
+[actuators.inner_loop]
+kind = "current"
+bandwidth = 900.0
+
+[[sensors]]
+position = 0.3
+
+[[loads]]
+kind = "mass"
+mass = 0.1
+speed = 6.0
+
+[controller]
+kind = "feedback"
+gains = [1e3]
+period = 0.01
+
+[run]
+duration = 0.12
+"""
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from jaxbeam.app.server import STATIC
 from jaxbeam.plot.style import ALARM, COLOURS, LOAD_COLOURS
-from tests.app.conftest import RIG, Server, decay, go
+from tests.app.conftest import RIG, SHAKER, Server, decay, go
 from tests.modules import ROOT
 
 TIMEOUT = 5000  # ms, from a slider to its picture
@@ -363,6 +363,11 @@ def test_a_controller_is_compared_with_the_bound(page):
     page.wait_for_selector(".control meter", timeout=120_000)
     names = page.locator(".control td:first-child").all_inner_texts()
     assert names == ["without control", "this case", "least of any"]
+    write(page, SHAKER)
+    page.get_by_role("button", name="Compare", exact=True).click()
+    page.get_by_text("no least achievable peak, as actuators.0.limits").wait_for(timeout=120_000)
+    names = page.locator(".control td:first-child").all_inner_texts()
+    assert names == ["without control", "this case"]
 
 
 def test_a_vehicle_is_chosen_by_its_picture_and_crosses(page):

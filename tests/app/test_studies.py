@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from tests.app.conftest import RIG, decay
+from tests.app.conftest import RIG, SHAKER, decay
 from tests.modules import ROOT
 
 SPEED = {"address": "loads.0.speed", "from": "1.8 km/h", "to": 1.5, "count": 4}
@@ -100,6 +100,16 @@ def test_controllers_of_the_folder_are_compared(workspace):
     record = jb.simulate(jb.api.load_case(other))
     assert peaks["softer"] == pytest.approx(float(record.peak_deflection[0]), rel=1e-6)
     assert found["bound"] <= peaks["this case"] < peaks["softer"] < found["uncontrolled"]
+    assert f"{found['bound']:.6g} m" in found["headline"]
+
+
+def test_a_comparison_without_a_bound_says_why(workspace):
+    found = finished(workspace, workspace.start_comparison(SHAKER, []))["result"]
+    with pytest.raises(ValueError, match="bound the voltage") as refused:
+        jb.bound(jb.api.load_case(SHAKER))
+    reason = str(refused.value).removesuffix(": leave them out")
+    assert found["bound"] is None and list(found["runs"]) == ["without", "this case"]
+    assert f"no least achievable peak, as {reason}" in found["headline"]
 
 
 def test_a_tuning_lowers_its_objective(workspace):

@@ -29,7 +29,7 @@ export function createControl(store) {
     ].map(([name, peak, one]) => html("tr", {}, html("td", {}, name), html("td.number", {}, `${number(peak / factor)} ${unit}`),
       html("td", {}, ...(one && one.share !== null ? [html("meter", { min: 0, max: 1, value: Math.max(0, one.share), "aria-label": "share of the attainable" }), ` ${share(one.share)}`] : [])),
       html("td.number", {}, one ? share(one.saturated) : ""), html("td", {}, one?.remarks ?? "")));
-    table.replaceChildren(html("table.data", {}, html("thead", {}, html("tr", {}, ...["controller", "peak", "of the attainable", "at a limit", "remarks"].map((words) => html("th", {}, words)))), html("tbody", {}, ...rows)));
+    table.replaceChildren(html("p", {}, found.headline), html("table.data", {}, html("thead", {}, html("tr", {}, ...["controller", "peak", "of the attainable", "at a limit", "remarks"].map((words) => html("th", {}, words)))), html("tbody", {}, ...rows)));
     pair.hidden = false;
     const runs = Object.entries(found.runs);
     const x = /** @type {any} */ (runs[0][1]).times;
