@@ -105,12 +105,16 @@ def plain(value: Any) -> Any:
     >>> plain({"peaks": np.array([1.0, np.nan])})
     {'peaks': [1.0, None]}
     """
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
+        return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
+        return [_plain(entry) for entry in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
