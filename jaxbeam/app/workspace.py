@@ -149,7 +149,7 @@ def _child(node: Any, key: str, address: str) -> Any:
 
 
 KEPT = 6  # cases, records and simulators in the caches
-PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 1e-2, 201  # of pictures while a slider moves
+PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 3e-2, 201  # of pictures while a slider moves
 MAX_BYTES = 2 * 2**20  # of the text of a case
 _STARTERS = resources.files("jaxbeam") / "files" / "starters"
 
