@@ -182,11 +182,8 @@ def _double_argument(functions, _):
     """exp and phi functions of twice the argument."""
     transition, phi_functions = functions
     propagated = vmap(functools.partial(_multiply, transition))(phi_functions)
-    # Spelt out: a product over the first axis would transpose the arrays twice.
-    weights = _doubling_weights().T.reshape(NODE_COUNT, NODE_COUNT, *(1,) * transition.ndim)
-    doubled = propagated + sum(
-        weight * phi for weight, phi in zip(weights, phi_functions, strict=True)
-    )
+    others = _doubling_weights() @ phi_functions.reshape(NODE_COUNT, -1)
+    doubled = propagated + others.reshape(phi_functions.shape)
     powers_of_half = 0.5 ** np.arange(1, NODE_COUNT + 1).reshape(
         NODE_COUNT, *(1,) * transition.ndim
     )
