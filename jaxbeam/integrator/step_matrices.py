@@ -46,6 +46,7 @@ from jaxbeam.runtime.arrays import (
 )
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
+FEW_STEPS = 16  # of one length, below which a call takes longer than their own propagators
 MANY_STATES = 48  # from which NumPy makes no matrix of all states for a step
 PREPARED_ENTRIES = 2**25  # entries of the largest matrix of all steps of a prepared run: 0.3 GB
 NUMPY_CHUNK_ENTRIES = 2**19  # entries of matrices that NumPy computes together, to fit in caches
@@ -69,12 +70,12 @@ class NodeMatrices(Module):
 class SpringMatrices(Module):
     """Maps of initial state, contact forces and commands to the motion under the wheels at nodes.
 
-    The motion is deflection or velocity, or both along an axis `motion`.
+    The motion is the deflection, then the velocity, of the surface.
     """
 
-    response: Float[Array, "step *motion row state"]
-    compliance: Float[Array, "step *motion row row"]
-    commands: Float[Array, "step *motion row command"] | None
+    response: Float[Array, "step motion row state"]
+    compliance: Float[Array, "step motion row row"]
+    commands: Float[Array, "step motion row command"] | None
 
 
 class StepMatrices(Module):
@@ -189,24 +190,31 @@ def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
 
 
 def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
-    """Matrices of the steps of a chunk in NumPy, computed together for steps of equal length."""
-    steps = np.arange(len(path.length_index))
-    indices = [steps[path.length_index == kind] for kind in set(path.length_index)]
+    """Matrices of the steps of a chunk in NumPy, computed together for steps of equal length.
 
-    def matrices_of(index):
-        rows = jax.tree.map(lambda part: part[index], path.rows)
-        kind = path.length_index[index[0]]
-        return _matrices_of_steps(discrete, _propagators_of(discrete, kind), rows)
+    Steps whose lengths are rare are together, too, each with its own propagators.
+    """
+    lengths, counts = np.unique(path.length_index, return_counts=True)
+    rare = np.isin(path.length_index, lengths[counts < FEW_STEPS])
+    groups = [(path.length_index == one, "") for one in lengths[counts >= FEW_STEPS]]
+    groups += [(rare, "t")] if rare.any() else []
 
-    if len(indices) == 1:
-        return matrices_of(steps)
+    def matrices_of(steps, t):
+        rows = jax.tree.map(lambda part: part[steps], path.rows)
+        own = path.length_index[steps]
+        return _matrices_of_steps(
+            discrete, _propagators_of(discrete, own if t else own[0]), rows, t
+        )
+
+    if len(groups) == 1:
+        return matrices_of(slice(None), groups[0][1])
     # Written into preallocated arrays: concatenation would take three times the memory.
     whole: Any = None
-    for index in indices:
-        part = matrices_of(index)
+    for steps, t in groups:
+        part = matrices_of(steps, t)
         if whole is None:
-            whole = jax.tree.map(lambda one: np.empty((len(steps), *one.shape[1:])), part)
-        jax.tree.map(lambda all_, one, index=index: operator.setitem(all_, index, one), whole, part)
+            whole = jax.tree.map(lambda one: np.empty((len(rare), *one.shape[1:])), part)
+        jax.tree.map(lambda all_, one, steps=steps: operator.setitem(all_, steps, one), whole, part)
     return whole
 
 
@@ -312,14 +320,16 @@ def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows
         )
     springs = None
     if motion.deflection is not None:
-        spring_rows = motion.deflection, motion.velocity
-        parts = [_spring_matrices(discrete, of_states, shape, rows, t) for rows in spring_rows]
-        springs = jax.tree.map(lambda *both: xp.stack(both, axis=1), *parts)
+        spring_rows = xp.concatenate([motion.deflection, motion.velocity], axis=1)
+        springs = _spring_matrices(discrete, of_states, shape, spring_rows, t)
     return *matrices, commands, node_states, springs
 
 
 def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> SpringMatrices:
-    """Maps to the deflection or the velocity of the surface under the wheels, from its `rows`."""
+    """Maps to the motion of the surface under the wheels, from its `rows`.
+
+    Rows are those to the deflection under all wheels, then to the velocity.
+    """
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
     response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
@@ -329,10 +339,13 @@ def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> Spri
     if discrete.modal_command_matrix is not None:
         by_command = of_states.input_nodes[..., 0, :, modes:]
         commands = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], by_command)
-        commands = commands.reshape(steps, size, -1)
+        count = math.prod(commands.shape[3:])
+        commands = commands.reshape(steps, 2, size, count)
     states = discrete.model.state_count
     return SpringMatrices(
-        response.reshape(steps, size, states), compliance.reshape(steps, size, size), commands
+        response.reshape(steps, 2, size, states),
+        compliance.reshape(steps, 2, size, size),
+        commands,
     )
 
 

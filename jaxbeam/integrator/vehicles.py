@@ -40,6 +40,7 @@ from jaxbeam.runtime.arrays import (
     cond,
     is_jax,
     map_elements,
+    set_at,
     solve_conditioned,
     stop_gradient,
     take,
@@ -279,7 +280,7 @@ def _state_maps(vehicles: Vehicles, step: StepInput, surface):
     parts = surface.reshape(steps, batch, -1, NODE_COUNT, columns)
     parts = parts * step.vehicles.on_beam[:, None, :, None, None]
     step_index, batch_index = np.ogrid[:steps, :batch]
-    by_wheel = add_at(
+    by_wheel = set_at(
         np.zeros((steps, batch, loads.wheel_count, NODE_COUNT, columns)),
         (step_index[..., None], batch_index[..., None], wheels[:, None]),
         parts,
