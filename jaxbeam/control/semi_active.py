@@ -28,7 +28,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, choice, concrete, count, is_concre
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 NEAR = 1e-6  # of the length, distance of a sensor from its actuator
-SHARED = "period", "delay", "dropout", "jitter", "resolution"  # settings of both laws
+SHARED = "period", "delay", "dropout", "jitter", "resolution", "nominal_plant"  # of both laws
 
 
 class SemiActive(AbstractController):
@@ -124,7 +124,8 @@ class SemiActive(AbstractController):
         dampers = len(plant.case.driven) - self.active
         low, high = (xp.broadcast_to(one, dampers) for one in (self.min_damping, self.max_damping))
         sensors = velocity_sensors(plant.case)[:dampers]
-        return SemiActiveLaw(self._inner().law(plant), low, high, sensors, self.rates == "on-off")
+        desired = self._inner().design_law(plant)  # of the actuators that take commands, as here
+        return SemiActiveLaw(desired, low, high, sensors, self.rates == "on-off")
 
     def _inner(self) -> AbstractController:
         """The desired law with the period and the delay of this one."""

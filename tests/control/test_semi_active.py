@@ -72,10 +72,10 @@ def modal_solution(damper_force, times, active_force=lambda deflection: 0.0):
     return np.array(found).T
 
 
-@pytest.mark.parametrize("active", [False, True])
+@pytest.mark.parametrize("beside", ["nothing", "active force", "spring"])
 @pytest.mark.parametrize(("rates", "tolerance"), [("clipped", 2e-6), ("on-off", 2e-4)])
-def test_switching_damper_against_scipy(rates, tolerance, active):
-    """Alone, and beside an active force against the deflection elsewhere."""
+def test_switching_damper_against_scipy(rates, tolerance, beside):
+    """Alone, and beside an active force against the deflection elsewhere, or a spring there."""
 
     def force(deflection, velocity):
         desired = -GAIN * deflection
@@ -84,8 +84,11 @@ def test_switching_damper_against_scipy(rates, tolerance, active):
         return np.clip(desired, *sorted((-LEAST * velocity, -MOST * velocity)))
 
     case, law = CASE, semi_active(rates=rates)
-    gain = ACTIVE_GAIN if active else 0.0
-    if active:
+    gain = 0.0 if beside == "nothing" else ACTIVE_GAIN
+    if beside == "spring":
+        spring = jb.SpringDamper(ACTIVE, stiffness=gain)
+        case = dataclasses.replace(CASE, actuators=[spring, *CASE.actuators])
+    if beside == "active force":
         case = dataclasses.replace(
             CASE,
             actuators=[jb.PointForce(DAMPER), jb.PointForce(ACTIVE)],
