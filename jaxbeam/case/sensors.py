@@ -241,11 +241,9 @@ def filter_step(
     next_state = []
     for s, (first, second) in zip(sections, filter_state, strict=True):
         output = s[0] * sample + first
-        next_state.append(
-            xp.stack([s[1] * sample - s[4] * output + second, s[2] * sample - s[5] * output])
-        )
+        next_state.append([s[1] * sample - s[4] * output + second, s[2] * sample - s[5] * output])
         sample = output
-    return sample, xp.stack(next_state)
+    return sample, xp.array(next_state)
 
 
 def filter_history(

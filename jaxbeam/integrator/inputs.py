@@ -4,7 +4,8 @@ import abc
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Float, Int
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
@@ -33,10 +34,9 @@ class AbstractInputPolicy(Module):
     implicit: eqx.AbstractVar[bool]
     load_amplitude: eqx.AbstractVar[Float[Array, "*batch"]]
 
-    @property
-    def holds_commands(self) -> bool:
-        """Whether commands and memory change only at events of the schedule."""
-        return False
+    def acts_at(self, events: Int[np.ndarray, " step"]) -> Bool[np.ndarray, " step"]:
+        """Whether commands, memory or observations may change at events; negative where is none."""
+        return np.ones(events.shape, bool)
 
     @abc.abstractmethod
     def start(self, batch_size: int) -> Any:
@@ -71,9 +71,8 @@ class HeldCommands(AbstractInputPolicy):
     load_amplitude: Float[Array, " batch"]
     implicit: ClassVar[bool] = False
 
-    @property
-    def holds_commands(self):
-        return True
+    def acts_at(self, events):
+        return events >= 0
 
     def start(self, batch_size):
         return xp.zeros(self.commands.shape[1:])

@@ -154,7 +154,8 @@ def _advance_concrete(policy, of_states, infos, state, memory):
     # State and commands.
     sources = np.ones((count + 1, batch_size, of_states.linear.shape[-1]))
     sources[0, :, :state_count] = state.T
-    events, observations, held = infos.event.tolist(), [], None
+    acts, observations, held = policy.acts_at(infos.event), [], None
+    acts[0] = True
     given, observed = policy.of_time(infos), None
     if any_jax(given):
         return None
@@ -162,7 +163,7 @@ def _advance_concrete(policy, of_states, infos, state, memory):
         state = sources[i, :, :state_count]
         if given is not None:
             held = given[i].ravel()
-        elif events[i] >= 0 or i == 0 or not policy.holds_commands:
+        elif acts[i]:
             info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
             node_commands, memory = policy.inputs(memory, state.T, info, None)
             if i == 0 and any_jax(node_commands, memory):

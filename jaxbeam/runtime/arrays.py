@@ -40,7 +40,7 @@ def is_jax(value: Any) -> bool:
     """Whether a value, or any in a nested list or tuple, is an array of JAX."""
     if type(value) in _NOT_JAX:
         return False
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):  # a union of types would be made anew in each call
         return any(map(is_jax, value))
     return isinstance(value, jax.Array)
 
@@ -392,18 +392,22 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
     """`jax.vmap`; concrete arguments are looped over in Python (for many see `vectorised`)."""
 
     def mapped(*args):
-        if any_jax(args):
+        leaves, structure = jax.tree.flatten(args)
+        if any(map(is_jax, leaves)):
             return jax.vmap(function, in_axes, out_axes)(*args)
-        if any(isinstance(leaf, VectorisedArray) for leaf in jax.tree.leaves(args)):
+        if any(isinstance(leaf, VectorisedArray) for leaf in leaves):
             return vectorised.vectorised(function, out_axes)(*args)
-        axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
-        pairs = zip(args, axes, strict=True)
-        leaves = [(leaf, axis) for arg, axis in pairs for leaf in jax.tree.leaves(arg)]
+        if isinstance(in_axes, tuple):
+            pairs = zip(args, in_axes, strict=True)
+            axes = [axis for arg, axis in pairs for _ in jax.tree.leaves(arg)]
+        else:
+            axes = [in_axes] * len(leaves)
+        leaves = list(zip(leaves, axes, strict=True))
         size = next(leaf.shape[axis] for leaf, axis in leaves if axis is not None)
         if size == 0:
             shapes = jax.eval_shape(jax.vmap(function, in_axes, out_axes), *args)
             return jax.tree.map(lambda part: np.zeros(part.shape, part.dtype), shapes)
-        structure, results = jax.tree.structure(args), []
+        results = []
         for i in range(size):
             element = structure.unflatten([_at(leaf, axis, i) for leaf, axis in leaves])
             result, result_structure = jax.tree.flatten(function(*element))

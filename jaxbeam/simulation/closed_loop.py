@@ -234,9 +234,14 @@ class SampledLoop(AbstractInputPolicy):
     voltages: VoltageLimits | None = None
     implicit: bool = eqx.field(static=True, default=False)
 
-    @property
-    def holds_commands(self):
-        return self.voltages is None
+    def acts_at(self, events):
+        if self.voltages is not None:
+            return super().acts_at(events)
+        schedule, ages = self.schedule, self.schedule.reading_age
+        due = np.any(schedule.reading >= 0, axis=1)
+        due |= (schedule.control_sample >= 0) | (schedule.command_age >= 0)
+        due[1:] |= np.any(ages[1:] != ages[:-1], axis=1)
+        return (events >= 0) & due[events]
 
     def start(self, batch_size):
         sensors, zero = self.plant.case.sensors, xp.zeros(batch_size)
@@ -313,14 +318,14 @@ class SampledLoop(AbstractInputPolicy):
     def _sample_sensors(self, memory, state, info):
         """Filter states and readings after the samples that are due at an event."""
         readings, filter_states, histories = memory.readings, [], []
+        numbers = take(self.schedule.reading, info.event)
         signals = cond(
-            xp.any(take(self.schedule.reading, info.event) >= 0),
+            xp.any(numbers >= 0),
             lambda state: self._sensor_inputs(state, self.path.acting(memory.commands), info.start),
             lambda state: xp.zeros((self.output_rows.shape[0], state.shape[1])),
             state,
         )
-        for i, sensor in enumerate(self.plant.case.sensors):
-            number = take(self.schedule.reading, (info.event, i))
+        for i, (sensor, number) in enumerate(zip(self.plant.case.sensors, numbers, strict=False)):
             if not is_jax(number) and number < 0:
                 filter_states.append(memory.filter_states[i])
                 histories.append(readings[:, i])
@@ -337,9 +342,8 @@ class SampledLoop(AbstractInputPolicy):
 
     def _available_readings(self, readings, event):
         """Latest readings (sensor, batch) that are available at an event."""
-        ages = [take(self.schedule.reading_age, (event, i)) for i in range(readings.shape[1])]
-        latest = [take(readings, (age, i)) for i, age in enumerate(ages)]
-        return xp.stack(latest) if latest else readings[0]
+        ages = take(self.schedule.reading_age, event)[: readings.shape[1]]
+        return take(readings, (ages, np.arange(readings.shape[1])))
 
     def _sensor_inputs(self, state, command, time):
         """Inputs of the sensors (sensor, batch) at a time (s)."""

@@ -490,7 +490,7 @@ def _choose_substeps(
     first_states = None
     if first_run is not None and policy is not None:
         first_states, commands = map(np.asarray, first_run(min_substeps, policy))
-        if policy.holds_commands:
+        if not policy.acts_at(np.array([-1])).any():
             held = HeldCommands(policy.model, commands, policy.load_amplitude)
             fine = np.asarray(trial_run(case, shapes, schedule, np.asarray(2 * min_substeps), held))
             error = AMPLIFICATION * change(first_states, fine)
