@@ -32,7 +32,7 @@ speed = "3.6 km/h"
 duration = 1.3
 sample_rate = 500.0
 """
-SHAKER = """# A shaker within an inner loop, whose voltage has limits: no peak can be proved the least.
+SHAKER = """# Shaker in an inner loop with limits of voltage: no peak can be proved the least.
 [beam]
 length = 0.6
 flexural_rigidity = 11.68
