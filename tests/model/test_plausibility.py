@@ -754,6 +754,17 @@ def test_a_run_without_a_load_on_the_beam_is_not_praised():
     assert np.all(record.deflection == 0)
 
 
+def test_runs_after_a_right_one_of_like_numbers_are_judged_too():
+    """Crossings of 1.5 s, in runs of 1.9 s and of 1.2 s, which peaks may miss."""
+    load = jb.MovingForce(force=1e5, speed=20.0)
+    right, cut = (
+        jb.Case(jb.Beam(30.0, 3e10, 1e4), loads=[load], run=jb.Run(end, 50.0)) for end in (1.9, 1.2)
+    )
+    jb.simulate(right)
+    with pytest.warns(PlausibilityWarning, match="it has not left the beam by the end of the run"):
+        jb.simulate(cut)
+
+
 IN_KILONEWTONS = {"flexural_rigidity": 30e6}
 
 

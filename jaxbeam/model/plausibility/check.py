@@ -4,7 +4,6 @@ Wrong units make a case that computes and means nothing: E I in kN m^2, a speed 
 t. What follows from them (first frequency, static deflection, mass ratio, critical speed) shows it.
 """
 
-import collections
 import contextvars
 import dataclasses
 import functools
@@ -107,9 +106,7 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
     """Warn of implausible numbers of a concrete case; its modes, if given, are `found`.
 
     Python shows each sentence once in a process, as all come from one place. An invalid case, or
-    one without modes, gets its error from the function that uses it. A case whose numbers have the
-    signs and powers of two of a recent one without warnings is not checked again, so that a loop
-    over runs does not pay for it.
+    one without modes, gets its error from the function that uses it.
     """
     for sentence in _warnings_of(case, found) or ():
         warnings.warn(sentence, PlausibilityWarning, stacklevel=1)
@@ -136,20 +133,14 @@ def _warnings_of(case: Case, found: Modes | None = None) -> tuple[str, ...] | No
     """Warnings of a case; None if they are left to the caller, or the case is traced or invalid."""
     if _SHOWN.get() or not all_concrete(case):
         return None
-    sizes = _sizes(case)
-    if sizes in _PLAUSIBLE:
-        return ()
     try:
         if found is None:
             check_case(case)
         else:
             found = jax.tree.map(concrete, found)
-        sentences = _checked(concrete_case(case), found).warnings
+        return _checked(concrete_case(case), found).warnings
     except (ValueError, np.linalg.LinAlgError, jax.errors.ConcretizationTypeError):
         return None
-    if not sentences:
-        _PLAUSIBLE.append(sizes)
-    return sentences
 
 
 @functools.wraps(beam_modes.modes)
@@ -165,14 +156,6 @@ def leave_warnings_to_caller() -> None:
     _SHOWN.set(True)
 
 
-def _sizes(case: Case) -> tuple:
-    """Structure of a case, and signs and powers of two of its numbers."""
-    numbers, structure = jax.tree.flatten(case)
-    values = np.concatenate([np.ravel(concrete(number)) for number in numbers])
-    return structure, np.sign(values).tobytes(), np.frexp(values)[1].tobytes()
-
-
-_PLAUSIBLE = collections.deque(maxlen=64)  # sizes of the latest cases without a warning
 _SHOWN = contextvars.ContextVar("plausibility_shown", default=False)
 
 

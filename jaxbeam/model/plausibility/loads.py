@@ -32,6 +32,7 @@ LARGEST_IN_KHZ = 10.0  # of a sample rate of 10 kHz
 LATE_BY_TABLE = 100.0  # times the run, until a load leaves
 FEEDBACK = ("feedback", "output-feedback", "feedback-scheduled", "pd", "ppf")
 SMALL_UNITS = {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2", "1": "1e-6", "Pa": "MPa"}
+LARGE_UNITS = {"m/s^2": "g", "Pa": "MPa", "1": "per cent"}
 
 
 # Loads: vehicles, weights, people
@@ -386,6 +387,30 @@ def _error_of(sensor, size: float, name: str, given: float) -> Iterator[Value]:
         unit = "m/m" if sensor.unit == "1" else sensor.unit
         words = {"given": abs(given), "unit": unit, "size": size, "small": small}
         yield Value(name, abs(given) / size, words)
+
+
+def rest_off_range(facts):
+    """Distance of the reading of a sensor at rest, its offset, from its range."""
+    for address, sensor in parts_of(facts, "sensors"):
+        if sensor.range is not None:
+            (low, high), rest = map(float, sensor.range), float(sensor.offset)
+            words = {"low": low, "high": high, "rest": rest, "unit": sensor.unit}
+            words["size"] = max(abs(low), abs(high))
+            yield Value(f"{address}.range", max(low - rest, rest - high, 0.0), words)
+
+
+def readings_over_range(facts):
+    """Size of the readings of a sensor over what its range leaves on the wider side of rest."""
+    for address, _, words in rest_off_range(facts):
+        sensor = facts.case.sensors[int(address.split(".")[1])]
+        size, room = (
+            facts.reading(sensor),
+            max(words["high"] - words["rest"], words["rest"] - words["low"]),
+        )
+        if size and room > 0:
+            large = LARGE_UNITS.get(sensor.unit, f"1e3 {sensor.unit}")
+            unit = "m/m" if sensor.unit == "1" else sensor.unit
+            yield Value(address, size / room, {"size": size, "large": large, "unit": unit})
 
 
 def sides_of_jumps(facts):
