@@ -180,6 +180,5 @@ def _passage_time(case: Case, position: float) -> float:
     trajectories = load_set(case).trajectories
     if not trajectories:
         return 0.0
-    times = concrete(trajectories[0].passage_times(xp.asarray([position])))
-    times = times[np.abs(times) < NEVER]
-    return float(times[0]) if times.size else 0.0
+    passage, *_ = concrete(trajectories[0].passage_times(xp.asarray([position])))
+    return float(passage) if abs(passage) < NEVER else 0.0

@@ -13,6 +13,7 @@ import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.analysis.stability import growth, loop_gain, margins, stability_margin
 from jaxbeam.analysis.stationary_loop import loop_with_mass_at, stationary_loops
+from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.cli import main
 from tests.loop_as_oracle import span_of
 
@@ -64,6 +65,33 @@ def test_margins_and_responses_with_a_mass_at_a_position():
     assert_allclose(-exported, response, atol=1e-9 * scale)
     with pytest.raises(ValueError, match="off the beam, 0 to 0.6 m"):
         loop_with_mass_at(case, 0.7, MASS)
+
+
+class GrowingGain(AbstractStaticController):
+    """Feedback of the first reading by a gain that grows by its value at t = 0 in each second."""
+
+    def command(self, state, measurement, t):
+        return -GAIN * (1 + t) * measurement.readings[:1]
+
+
+@pytest.mark.parametrize(
+    ("loads", "time"),
+    [
+        ((), 0.0),
+        ((jb.MovingMass(mass=0.3, speed=2.0, entry_time=0.4),), 0.4 + POSITION / 2),
+        ((jb.MovingMass(mass=0.3, speed=-2.0, entry_time=0.4),), 0.4 + (0.6 - POSITION) / 2),
+        ((jb.MovingMass(mass=0.3, speed=2.0, deceleration=20.0, entry_time=0.4),), 0.0),
+        ((jb.MovingMass(mass=0.3, times=[0.2, 0.7], positions=[0.0, 0.3]),), 0.0),
+        ((jb.VaryingForce(force=3.0, position=POSITION, entry_time=0.4),), 0.0),
+    ],
+    ids=["no load", "to the right", "to the left", "stops before", "table ends before", "stands"],
+)
+def test_a_law_is_that_of_the_passage_of_the_first_load(loads, time):
+    """A load that passes a place gives the time of a law there; else that is t = 0."""
+    case = dataclasses.replace(lagging_case(), controller=GrowingGain(), loads=loads)
+    expected = (1 + time) * loop_of_matrices(case)
+    found = loop_with_mass_at(case, POSITION, MASS).to_control()
+    assert_allclose(-response(found), response(expected), rtol=1e-8)
 
 
 def cubic_case() -> jb.Case:
