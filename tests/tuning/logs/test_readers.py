@@ -3,10 +3,12 @@
 import gc
 import gzip
 import io
+import os
 import re
 import warnings
 import wave
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -689,6 +691,21 @@ def test_workbook_that_is_damaged(tmp_path):
     path.write_bytes(b"PK\x03\x04 and nothing else")
     with pytest.raises(ValueError, match="run.xlsx: the file is damaged or cut off"):
         read_log(path)
+
+
+def test_workbook_with_a_damaged_sheet_is_closed(tmp_path):
+    path = tmp_path / "run.xlsx"
+    xlsx(path)
+    with zipfile.ZipFile(path) as book:
+        parts = {name: book.read(name) for name in book.namelist()}
+    with zipfile.ZipFile(path, "w") as book:  # not compressed
+        for name, part in parts.items():
+            book.writestr(name, part)
+    path.write_bytes(path.read_bytes().replace(b"<v>0.002</v>", b"<v>0.003</v>"))
+    with pytest.raises(ValueError, match="run.xlsx: the file is damaged .* Bad CRC-32") as refused:
+        read_log(path)
+    opened = map(os.path.realpath, Path("/proc/self/fd").glob("*"))
+    assert str(path.resolve()) not in opened, refused.value
 
 
 def node(times, seed, clock_offset=0.0, clock_rate=1.0, sign=1.0):

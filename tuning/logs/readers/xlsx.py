@@ -1,11 +1,12 @@
 """Workbooks of Excel (.xlsx), by openpyxl: each sheet with a table of numbers is a run."""
 
 import datetime
+import io
 from pathlib import Path
 
 from jaxbeam.files.endings import import_extra
 from tuning.logs.readers.headings import find_headings, is_numeric, table_of_rows
-from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error
+from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, read_bytes
 
 MAGIC = b"PK\x03\x04"
 
@@ -20,10 +21,10 @@ def read_xlsx(path: Path) -> dict[str, LogTable]:
     ImportError without openpyxl.
     """
     openpyxl = import_extra("openpyxl", "tables")
+    content = io.BytesIO(read_bytes(path))  # openpyxl would leave a damaged file open
     try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        book = openpyxl.load_workbook(content, read_only=True, data_only=True)
         sheets = {sheet.title: list(sheet.iter_rows(values_only=True)) for sheet in book}
-        book.close()
     except Exception as error:  # openpyxl raises many types for damaged files
         raise damaged_file_error(path, error) from None
     tables = {}
