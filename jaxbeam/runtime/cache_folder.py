@@ -85,12 +85,6 @@ def read_file(name: str) -> bytes | None:
     return content
 
 
-def mark_used(name: str) -> None:
-    """Let a file count as used now, for `evict`."""
-    with contextlib.suppress(OSError):
-        os.utime(cache_folder() / name)
-
-
 def write_file(name: str, content: bytes) -> pathlib.Path:
     """Write a file with its HMAC, in one step, so that no process reads half of it; its path.
 

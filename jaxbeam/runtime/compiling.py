@@ -1,6 +1,5 @@
 """Compilation of functions by XLA, with options for programs of many small kernels."""
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -13,8 +12,6 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.runtime import compile_cache
-from jaxbeam.runtime.compile_cache import program_name
 from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
@@ -72,108 +69,53 @@ class Compiled(Generic[P, R]):
     @functools.cached_property
     def jitted(self):  # at the first call, since `xla_options` starts XLA
         """`jax.jit` of the function of (arrays, static arguments)."""
-        return self.jitted_as(self.__name__)
-
-    def jitted_as(self, name: str):
-        """`jitted` with another name of the program."""
         options = xla_options(**self.settings)
-        return jax.jit(_renamed(self._program, name), static_argnums=1, compiler_options=options)
+        program = _renamed(self._program, self.__name__)
+        return jax.jit(program, static_argnums=1, compiler_options=options)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _partition((args, kwargs))
-        if _is_tracing(arrays):
-            arrays, outputs = self._jitted_inner(arrays, tuple(rest))
-        elif compile_cache.enabled() and (entry := self._entry(arrays, rest)).cache_name:
-            self._compilation(entry, arrays, rest)()
-            arrays, outputs = entry.program(arrays)
-        else:
-            arrays, outputs = self.jitted(arrays, tuple(rest))
+        program = self._jitted_inner if _is_tracing(arrays) else self.jitted
+        arrays, outputs = program(arrays, tuple(rest))
         return _combine(arrays, *outputs.static)
 
     def precompile(self, *args: P.args, **kwargs: P.kwargs) -> Callable[[], Any]:
         """Trace for arguments of this structure, and return a function that compiles.
 
         Tracing holds Python's global lock, compiling does not, so the latter may run in a thread.
-        Calls with such arguments then do neither. A program in the cache (`compile_cache`) is not
-        traced but loaded.
+        Calls with such arguments then do neither.
         """
         arrays, *rest = _partition((args, kwargs))
-        return self._compilation(self._entry(arrays, rest), arrays, rest)
-
-    def _compilation(self, entry, arrays, rest):
-        """The function that `precompile` returns."""
-        if entry.compiled:
+        done, signature = _compiled_signatures(self), _signature(arrays, rest)
+        if signature in done:
             return lambda: None
-        if not entry.cached_code:
-            lowered = entry.jitted.lower(arrays, tuple(rest))
-            return lambda: self._compile(entry, lowered)
+        lowered = self.jitted.lower(arrays, tuple(rest))
 
-        def load_or_compile():
-            try:
-                entry.program = compile_cache.load_program(
-                    entry.cached_code, (arrays,), entry.outputs
-                )
-                entry.compiled = True
-            except jax.errors.JaxRuntimeError:
-                self._compile(entry, entry.jitted.lower(arrays, tuple(rest)))
-
-        return load_or_compile
-
-    def _compile(self, entry, lowered):
-        if entry.cache_name is None:
+        def compile_program():
             lowered.compile()
-        else:
-            with compile_cache.jax_cache_off():
-                entry.program = lowered.compile()
-            compile_cache.save_program(entry.cache_name, entry.program, lowered.out_info)
-        entry.compiled = True
+            done.add(signature)
+
+        return compile_program
 
     def template(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Outputs of a call with zeros for numbers, found without compilation."""
         arrays, *rest = _partition((args, kwargs))
-        entry = self._entry(arrays, rest)
-        entry.outputs = entry.outputs or entry.jitted.eval_shape(arrays, tuple(rest))
-        shapes, outputs = entry.outputs
+        shapes, outputs = self.jitted.eval_shape(arrays, tuple(rest))
         zeros = [None if leaf is None else np.zeros(leaf.shape, leaf.dtype) for leaf in shapes]
         return _combine(zeros, *outputs.static)
 
-    def _entry(self, arrays, rest):
-        return _program_entry(self, _signature(arrays, rest))
-
-
-@dataclasses.dataclass(eq=False)
-class _ProgramEntry:
-    """State of a function for one argument signature."""
-
-    function: Compiled
-    cache_name: str | None  # in the cache of programs; None if it cannot or is not to be cached
-    cached_code: bytes  # from the cache, or empty
-    outputs: tuple[list, _StaticOutputs] | None  # shapes of the arrays, and the rest
-    compiled: bool = False
-    program: Any = None  # if it has a name in the cache; others are in the cache of `jitted`
-
-    @functools.cached_property
-    def jitted(self):
-        """The function under `jax.jit`, from which this program is lowered."""
-        if self.cache_name is None or not jax.config.jax_compilation_cache_dir:
-            return self.function.jitted
-        # A program that JAX finds in its own cache cannot be serialised, so it must not find it.
-        return self.function.jitted_as(f"{self.function.__name__}_{os.urandom(8).hex()}")
-
 
 @functools.cache
-def _program_entry(function: Compiled, identity: tuple) -> _ProgramEntry:
-    """Entry of a function for an argument signature; a hundred times faster than JAX's own."""
-    name = program_name(function, identity) if compile_cache.enabled() else None
-    cached = None if name is None else compile_cache.read_program(name)
-    return _ProgramEntry(function, name, *(cached or (b"", None)))
+def _compiled_signatures(function: Compiled) -> set[tuple]:
+    """Signatures of the arguments for which a function was precompiled."""
+    return set()
 
 
 def clear_caches() -> None:
     """Free all programs compiled in this process; those of many cases take gigabytes."""
     jax.clear_caches()
     _program_of.cache_clear()
-    _program_entry.cache_clear()
+    _compiled_signatures.cache_clear()
 
 
 @overload

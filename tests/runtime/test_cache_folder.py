@@ -8,7 +8,7 @@ import stat
 import pytest
 
 from jaxbeam.runtime import cache_folder
-from jaxbeam.runtime.cache_folder import CacheError, evict, mark_used, read_file, write_file
+from jaxbeam.runtime.cache_folder import CacheError, evict, read_file, write_file
 
 NAME, CONTENT = "program-wave-0", b"machine code"
 IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
@@ -211,7 +211,7 @@ def test_the_least_recently_used_files_are_evicted(folder):
     assert remaining() == ["jit_f-cache", "program-a", "program-b", "program-c"]
     evict(3200)
     assert remaining() == ["program-a", "program-b", "program-c"]
-    mark_used("program-a")
+    os.utime(folder / "program-a")
     evict(2100)
     assert remaining() == ["program-a", "program-c"]
     evict(0)

@@ -195,7 +195,6 @@ def test_the_folder_of_the_cache_is_told(caplog, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setattr(compile_cache.jax.config, "update", lambda name, value: None)
     monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "8")
-    monkeypatch.setattr(compile_cache, "max_bytes", lambda: 8 << 20)
     with caplog.at_level(logging.INFO, "jaxbeam"):
         compile_cache.switch_on()
     assert caplog.messages[0].startswith("compile cache in ")
