@@ -362,7 +362,7 @@ def test_a_controller_is_compared_with_the_bound(page):
     page.get_by_role("button", name="Compare", exact=True).click()
     page.wait_for_selector(".control meter", timeout=120_000)
     names = page.locator(".control td:first-child").all_inner_texts()
-    assert names == ["without control", "this case", "least of any"]
+    assert names == ["without control", "this case", "least achievable"]
     write(page, SHAKER)
     page.get_by_role("button", name="Compare", exact=True).click()
     page.get_by_text("no least achievable peak, as actuators.0.limits").wait_for(timeout=120_000)

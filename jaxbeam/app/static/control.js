@@ -1,4 +1,4 @@
-// Controllers side by side with the least peak of any; and numbers of one, tuned by gradient steps.
+// Controllers side by side with the least achievable peak; and numbers of one, tuned by gradient steps.
 
 import { ask } from "./api.js";
 import { html, number, scaled } from "./dom.js";
@@ -25,7 +25,7 @@ export function createControl(store) {
     const [factor, unit] = scaled(found.uncontrolled, "m");
     const share = (/** @type {number} */ value) => `${number(100 * value, 3)} %`;
     const rows = [
-      ["without control", found.uncontrolled, null], ...found.rows.map((/** @type {any} */ one) => [one.name, one.peak, one]), ...(found.bound === null ? [] : [["least of any", found.bound, null]]),
+      ["without control", found.uncontrolled, null], ...found.rows.map((/** @type {any} */ one) => [one.name, one.peak, one]), ...(found.bound === null ? [] : [["least achievable", found.bound, null]]),
     ].map(([name, peak, one]) => html("tr", {}, html("td", {}, name), html("td.number", {}, `${number(peak / factor)} ${unit}`),
       html("td", {}, ...(one && one.share !== null ? [html("meter", { min: 0, max: 1, value: Math.max(0, one.share), "aria-label": "share of the attainable" }), ` ${share(one.share)}`] : [])),
       html("td.number", {}, one ? share(one.saturated) : ""), html("td", {}, one?.remarks ?? "")));
