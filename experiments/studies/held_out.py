@@ -13,12 +13,19 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 import tuning
-from experiments.thesis.cases import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF
+from experiments.thesis.cases import (
+    ONE_SPAN_CUTOFF,
+    PEAK_TOLERANCE,
+    TWO_SPAN_CUTOFF,
+    simulate_cases,
+    simulate_changes,
+)
 from experiments.thesis.report import plot_commands, plot_deflections
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
 from tuning.control.load_cases import AddressValues
 from tuning.control.objective import with_fixed_design
+from tuning.control.run_set import make_run_set
 
 PERIOD = 0.01  # s, of sampling
 MASSES, ENTRY_TIME = (0.261, 0.509), 0.05  # kg, s: training
@@ -122,6 +129,31 @@ def with_rigidity(case: jb.Case, factor: float) -> jb.Case:
 def peaks(records: Sequence[jb.Record]) -> np.ndarray:
     """The largest deflection (m) at any sensor, (run,)."""
     return np.array([float(np.max(record.peak_deflection)) for record in records])
+
+
+def held_out_study(
+    controlled_cases: Mapping[str, jb.Case], loads: tuple[AddressValues, ...], tuned: str
+) -> HeldOutStudy:
+    """Runs of cases of one rig, by law, with all loads; of the `tuned` one off its design, too.
+
+    Each law takes one step in each interval between events, as the search for steps finds.
+    """
+    case = controlled_cases[tuned]
+    uncontrolled = make_run_set(case, loads, least_peaks=True).uncontrolled
+    records = {name: simulate_changes(one, loads) for name, one in controlled_cases.items()}
+    reductions = {name: 1 - peaks(found) / uncontrolled["peak"] for name, found in records.items()}
+    for name, factor in RIGIDITY_ERRORS.items():
+        plants = [with_rigidity(jb.replace(case, load), factor) for load in loads]
+        free = [dataclasses.replace(one, controller=None) for one in plants]
+        free_peaks = peaks([jb.simulate(one, tolerance=PEAK_TOLERANCE) for one in free])
+        reductions[name] = 1 - peaks(simulate_cases(plants)) / free_peaks
+    return HeldOutStudy(
+        title=case.title,
+        loads=loads,
+        achievable=1 - uncontrolled["least"] / uncontrolled["peak"],
+        reductions=reductions,
+        records={name: found[-1] for name, found in records.items()},
+    )
 
 
 @use_style

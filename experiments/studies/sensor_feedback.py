@@ -29,7 +29,7 @@ from experiments.studies.held_out import (
     HeldOutStudy,
     draw,
     held_out_loads,
-    peaks,
+    held_out_study,
     with_held_out_duration,
 )
 from experiments.studies.tune_feedforward import MODES
@@ -48,7 +48,6 @@ from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
 from tuning.control.load_cases import run_case
 from tuning.control.objective import with_fixed_design
-from tuning.control.run_set import make_run_set
 
 SENSORS_ONLY = "tuned, sensors only"
 DRAWN_LAWS = (CUBIC_FEEDBACK, HAND_DRAWN, SENSORS_ONLY, EXTRA_DELAY_LAW)
@@ -86,32 +85,21 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     law = bench.controller
     delayed_law = dataclasses.replace(law, delay=np.asarray(DELAY + EXTRA_DELAY))
     feedback_case = with_feedback(dataclasses.replace(case, run=bench.run), 3, CUBIC_CUTOFFS[rig])
-    run_sets = {
-        CUBIC_FEEDBACK: make_run_set(feedback_case, loads),
-        HAND_DRAWN: make_run_set(dataclasses.replace(bench, controller=drawn_table(rig)), loads),
-        SENSORS_ONLY: make_run_set(bench, loads, least_peaks=True),
-        EXTRA_DELAY_LAW: make_run_set(dataclasses.replace(bench, controller=delayed_law), loads),
+    slower = {
+        name: dataclasses.replace(
+            with_cutoff(bench, cutoff),
+            controller=dataclasses.replace(law, period=np.asarray(period)),
+        )
+        for name, (period, cutoff) in untuned_conditions(rig).items()
     }
-    for name, (period, cutoff) in untuned_conditions(rig).items():
-        slower = dataclasses.replace(law, period=np.asarray(period))
-        changed = dataclasses.replace(with_cutoff(bench, cutoff), controller=slower)
-        run_sets[name] = make_run_set(changed, loads)
-    # A run changes the plant alone: the law is designed for the beam of the case.
-    for name, factor in RIGIDITY_ERRORS.items():
-        change = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
-        run_sets[name] = make_run_set(bench, [load | change for load in loads])
-    records = {name: run_set.records({}) for name, run_set in run_sets.items()}
-    bounds = run_sets[SENSORS_ONLY].uncontrolled
-    return HeldOutStudy(
-        title=case.title,
-        loads=loads,
-        achievable=1 - bounds["least"] / bounds["peak"],
-        reductions={
-            name: 1 - peaks(found) / run_sets[name].uncontrolled["peak"]
-            for name, found in records.items()
-        },
-        records={name: found[-1] for name, found in records.items()},
-    )
+    controlled_cases = {
+        CUBIC_FEEDBACK: feedback_case,
+        HAND_DRAWN: dataclasses.replace(bench, controller=drawn_table(rig)),
+        SENSORS_ONLY: bench,
+        EXTRA_DELAY_LAW: dataclasses.replace(bench, controller=delayed_law),
+        **slower,
+    }
+    return held_out_study(controlled_cases, loads, SENSORS_ONLY)
 
 
 def untuned_conditions(rig: str) -> dict[str, tuple[float, float]]:

@@ -33,18 +33,15 @@ from experiments.studies.held_out import (
     CUBIC_FEEDBACK,
     EXTRA_DELAY,
     EXTRA_DELAY_LAW,
-    RIGIDITY,
-    RIGIDITY_ERRORS,
     HeldOutStudy,
     draw,
     held_out_loads,
-    peaks,
+    held_out_study,
     with_held_out_duration,
 )
 from experiments.studies.tune_feedforward import COMMAND_LIMITS, FOLDER, initial_law
 from experiments.thesis.cases import with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult
-from tuning.control.run_set import RunSet, make_run_set
 
 LOW, HIGH = COMMAND_LIMITS
 TRAPEZIA = {  # shares of the beam, V: from limit to limit, with ramps drawn by hand
@@ -97,24 +94,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
         BENCH: dataclasses.replace(case, controller=with_bench_delay(law)),
         EXTRA_DELAY_LAW: dataclasses.replace(case, controller=with_bench_delay(law, EXTRA_DELAY)),
     }
-    run_sets = {
-        name: make_run_set(one, loads, least_peaks=name == BENCH)
-        for name, one in controlled_cases.items()
-    }
-    records = {name: run_set.records({}) for name, run_set in run_sets.items()}
-    uncontrolled = run_sets[BENCH].uncontrolled
-    reductions = {name: 1 - peaks(found) / uncontrolled["peak"] for name, found in records.items()}
-    for name, factor in RIGIDITY_ERRORS.items():
-        change = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
-        controlled = peaks(run_sets[BENCH].records(change))
-        reductions[name] = 1 - controlled / uncontrolled_peaks(run_sets[BENCH], change)
-    return HeldOutStudy(
-        title=case.title,
-        loads=loads,
-        achievable=1 - uncontrolled["least"] / uncontrolled["peak"],
-        reductions=reductions,
-        records={name: found[-1] for name, found in records.items()},
-    )
+    return held_out_study(controlled_cases, loads, BENCH)
 
 
 def with_bench_delay(law: jb.Feedforward, extra_delay: float = 0.0) -> jb.Feedforward:
@@ -123,14 +103,6 @@ def with_bench_delay(law: jb.Feedforward, extra_delay: float = 0.0) -> jb.Feedfo
     `extra_delay` (s) is not compensated.
     """
     return dataclasses.replace(law, lead=law.lead + DELAY, delay=np.asarray(DELAY + extra_delay))
-
-
-def uncontrolled_peaks(run_set: RunSet, change: dict[str, float]) -> np.ndarray:
-    """Peaks (m) without control, (run,), of the runs of a set with changed numbers."""
-    cases = [
-        dataclasses.replace(jb.replace(case, change), controller=None) for case in run_set.cases
-    ]
-    return peaks([jb.simulate(case, tolerance=1e-4) for case in cases])
 
 
 EXPERIMENT = Experiment(

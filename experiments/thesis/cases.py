@@ -113,12 +113,16 @@ def with_feedback(
 
 
 def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> list[jb.Record]:
-    """Records of a case with several changes of its numbers, by one integration plan.
+    """Records of a case with several changes of its numbers, as `simulate_cases`."""
+    return simulate_cases([jb.replace(case, change) for change in changes])
+
+
+def simulate_cases(cases: Sequence[jb.Case]) -> list[jb.Record]:
+    """Records of cases that differ in their numbers, by one integration plan.
 
     A sampled loop takes one step in each of its periods: that meets the tolerance, as its search
     finds.
     """
-    cases = [jb.replace(case, change) for change in changes]
     plan = plan_with_steps(cases[-1], 1)
     with warnings.catch_warnings():
         # With too high gains the contact force becomes negative; the peaks show it.
