@@ -297,7 +297,7 @@ def linearise_each(loop: LoopDynamics, timing: LoopTiming | None, times) -> list
     try:
         return affine_linearisations(loop, timing, times)
     except NotAffineError:
-        return [linearise(loop, timing, t) for t in times]
+        return [_linearise(_derivatives_compiled, loop, timing, t) for t in times]
 
 
 def _derivatives(loop: LoopDynamics, timing: LoopTiming | None, t, state) -> _Derivatives:
