@@ -149,11 +149,8 @@ class Comparison(TableViews, Module):
         """Peaks without control and under the bound, in one sentence, or why there is no bound."""
         if self.bound is not None:
             return self.bound.verdict
-        return (
-            f"largest deflection without control {np.max(self.uncontrolled.peak_deflection):.4g} m;"
-            f" no least achievable peak, as {no_bound(self.case)}; times at limits are those of"
-            " commands, not of voltages"
-        )
+        times = "times at limits are those of commands, not of voltages"
+        return f"{without_bound(self.uncontrolled)}; {times}"
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -210,6 +207,14 @@ class Comparison(TableViews, Module):
                     f" uncontrolled deflection, at {oscillation.frequency:.3g} Hz"
                 )
         return "; ".join(parts)
+
+
+def without_bound(uncontrolled: Record) -> str:
+    """Peak of an uncontrolled run, and why its case has no bound, in a clause."""
+    return (
+        f"largest deflection without control {np.max(uncontrolled.peak_deflection):.4g} m; no least"
+        f" achievable peak, as {no_bound(uncontrolled.case)}"
+    )
 
 
 @refuses_traced("a comparison")
@@ -328,14 +333,19 @@ class FaultedPeak(NamedTuple):
 
     `peak` is the largest deflection at the sensors (m), NaN of a run that diverges, `uncontrolled`
     that of the same beam without control, `share` the fraction of the attainable reduction (see
-    `Bound.share`), negative where the law is worse than none. `at` names the run if a fault has
-    several: "sensor 1", "seed 3".
+    `Bound.share`), negative where the law is worse than none and NaN without a bound. `at` names
+    the run if a fault has several: "sensor 1", "seed 3".
     """
 
     peak: float
     uncontrolled: float
     share: float
     at: str
+
+    @property
+    def reduction(self) -> float:
+        """Reduction of the peak as a fraction of that without control."""
+        return 1 - self.peak / self.uncontrolled
 
     @property
     def is_worse_than_none(self) -> bool:
@@ -439,13 +449,14 @@ def compare_under_faults(
     controllers: Mapping[str, AbstractController],
     period: float | None = None,
     faults: Sequence[LoopFault] = FAULTS,
-) -> tuple[dict[str, dict[str, FaultedPeak | None]], Bound]:
+) -> tuple[dict[str, dict[str, FaultedPeak | None]], Bound | Record]:
     """Worst peaks of controllers under each fault, by name and fault, and the case's bound.
 
     Laws are designed for the case without the fault. The attainable reduction of a run is that by
     the bound of its own beam, with commands held over `period` (s), by default the shortest period
-    of the controllers or 0.01 s. Random faults are run with five seeds from that of the case. None
-    stands for faults of samples of a law in continuous time.
+    of the controllers or 0.01 s. Where limits of a voltage within an inner loop allow no bound, the
+    run without control takes its place. Random faults are run with five seeds from that of the
+    case. None stands for faults of samples of a law in continuous time.
 
     Raises ValueError as `compare`.
 
@@ -472,14 +483,15 @@ def compare_under_faults(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         uncontrolled = simulate(free)
-        bounds: dict[bytes, Bound] = {}
+        without: dict[bytes, Bound | Record] = {}
 
-        def least_peak(one: Case) -> Bound:
-            """Bound of the beam of a case, found once."""
+        def without_law(one: Case) -> Bound | Record:
+            """Bound of the beam of a case, or its run without control, found once."""
             key = np.asarray(concrete(one.beam.flexural_rigidity)).tobytes()
-            if key not in bounds:
-                bounds[key] = bound(dataclasses.replace(free, beam=one.beam), period=period)
-            return bounds[key]
+            if key not in without:
+                own = dataclasses.replace(free, beam=one.beam)
+                without[key] = simulate(own) if no_bound(own) else bound(own, period=period)
+            return without[key]
 
         table = {}
         for name, law in controllers.items():
@@ -490,11 +502,12 @@ def compare_under_faults(
                     table[name][fault.name] = None
                     continue
                 variants = fault.variants(case_with_law, uncontrolled)
-                runs = [_peak(name, one, at, least_peak(one)) for at, one in variants.items()]
-                table[name][fault.name] = min(
-                    runs, key=lambda run: np.nan_to_num(run.share, nan=-np.inf)
+                runs = [_peak(name, one, at, without_law(one)) for at, one in variants.items()]
+                # Of one beam: the largest peak is the least share.
+                table[name][fault.name] = max(
+                    runs, key=lambda run: np.nan_to_num(run.peak, nan=np.inf)
                 )
-    return table, least_peak(free)
+    return table, without_law(free)
 
 
 def _with_fixed_design(case: Case) -> Case:
@@ -505,10 +518,12 @@ def _with_fixed_design(case: Case) -> Case:
     return dataclasses.replace(case, controller=law)
 
 
-def _peak(name: str, case: Case, at: str, least_peak: Bound) -> FaultedPeak:
+def _peak(name: str, case: Case, at: str, without: Bound | Record) -> FaultedPeak:
     try:
         record = simulate(case)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     peak = float(np.max(record.peak_deflection))
-    return FaultedPeak(peak, least_peak.uncontrolled, least_peak.share(record), at)
+    if isinstance(without, Bound):
+        return FaultedPeak(peak, without.uncontrolled, without.share(record), at)
+    return FaultedPeak(peak, float(np.max(without.peak_deflection)), np.nan, at)

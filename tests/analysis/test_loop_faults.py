@@ -6,10 +6,13 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.interpolate import CubicSpline
 
 import jaxbeam as jb
 from jaxbeam.analysis.compare import FAULTS, FaultedPeak, compare_under_faults
 from jaxbeam.cli import main
+from jaxbeam.model.sensor_signals import sent_readings
+from tests.case.test_actuators import LOOPS, PERIOD, by_its_equations, crossing, shaker
 
 FORCE = 4.0  # N
 
@@ -150,6 +153,77 @@ def test_command(tmp_path, capsys, monkeypatch):
     assert found["faults"]["case"]["stuck"]["at"] == "sensor 0"
     assert _code(f"{command} --over loads.0.mass=0.1,0.2") == 2
     assert "leave out -o, --over and --cases" in capsys.readouterr().err
+
+
+LOOP, LIMITS, GAIN, FINE = LOOPS["current"], [-0.2, 0.3], 1e3, 10  # FINE: times in each period
+IN_INNER_LOOP = crossing(shaker(LOOP, limits=LIMITS), controller=jb.Feedback([GAIN], period=PERIOD))
+
+
+def peak_by_scipy(readings=None, rigidity=11.68) -> float:
+    """Peak of a run whose readings, at the samples, are `readings(k, w)` for the deflection w."""
+    latest, periods = [0.0], round(float(IN_INNER_LOOP.run.duration) / PERIOD)
+
+    def reading(k, deflection):
+        if k % FINE == 0:
+            latest[0] = deflection if readings is None else readings(k // FINE, deflection)
+        return latest[0]
+
+    times = np.arange(periods * FINE + 1) * PERIOD / FINE
+    history, *_ = by_its_equations(LOOP, times, GAIN, LIMITS, True, reading, rigidity)
+    curve = CubicSpline(times, history)
+    return float(np.abs(curve(np.linspace(0.0, times[-1], 100 * times.size))).max())
+
+
+@pytest.fixture(scope="module")
+def within_limits():
+    wanted = "none", "5 % lost", "stuck", "E I -15 %"
+    faults = tuple(fault for fault in FAULTS if fault.name in wanted)
+    return compare_under_faults(IN_INNER_LOOP, {"law": IN_INNER_LOOP.controller}, faults=faults)
+
+
+def test_limits_of_a_voltage_have_no_shares(within_limits):
+    (of_faults,), free = within_limits[0].values(), within_limits[1]
+    assert all(np.isnan(one.share) for one in of_faults.values())
+    uncontrolled = peak_by_scipy(lambda k, deflection: 0.0)
+    assert_allclose(free.peak_deflection, uncontrolled, rtol=1e-5)
+    for name in ("none", "5 % lost", "stuck"):
+        assert_allclose(of_faults[name].uncontrolled, uncontrolled, rtol=1e-5)
+    assert_allclose(of_faults["none"].reduction, 1 - peak_by_scipy() / uncontrolled, rtol=1e-3)
+
+
+def test_faults_beside_limits_of_a_voltage(within_limits):
+    (of_faults,) = within_limits[0].values()
+    assert_allclose(of_faults["none"].peak, peak_by_scipy(), rtol=1e-5)
+    assert_allclose(of_faults["stuck"].peak, peak_by_scipy(lambda k, w: 0.0), rtol=1e-5)
+    assert_allclose(of_faults["E I -15 %"].peak, peak_by_scipy(None, 0.85 * 11.68), rtol=1e-5)
+    sensor, peaks = jb.Sensor(0.3, dropout=0.05), []
+    for seed in range(5):
+        lost, _ = sent_readings(seed, 0, sensor, 20)
+        held = [0.0]
+
+        def latest(k, deflection, lost=lost, held=held):
+            held[0] = held[0] if lost[k] else deflection
+            return held[0]
+
+        peaks.append(peak_by_scipy(latest))
+    assert np.ptp(peaks) > 1e-3 * max(peaks)
+    assert_allclose(of_faults["5 % lost"].peak, max(peaks), rtol=1e-5)
+    assert of_faults["5 % lost"].at == f"seed {np.argmax(peaks)}"
+
+
+def test_the_command_names_reductions_where_there_is_no_bound(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxbeam.analysis.compare.compare_under_faults", _of_one_run)
+    jb.save_case(IN_INNER_LOOP, tmp_path / "case.toml")
+    assert _code(f"compare {tmp_path / 'case.toml'} --faults") == 0
+    text = capsys.readouterr().out
+    assert "no least achievable peak, as actuators.0.limits bound the voltage" in text
+    assert "reduction of the peak, at worst" in text
+    reduction = 1 - peak_by_scipy() / peak_by_scipy(lambda k, w: 0.0)
+    assert f"{reduction:.1%}" in text
+    assert _code(f"compare {tmp_path / 'case.toml'} --faults --json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["least_peak"] is None
+    assert found["faults"]["case"]["none"]["share"] is None
 
 
 def _code(line: str) -> int:

@@ -185,14 +185,18 @@ def crossing(*actuators, **changes) -> jb.Case:
     return jb.Case(BEAM, actuators=actuators, **(parts | changes))
 
 
-def by_its_equations(loop, times, gain=GAIN, limits=(-np.inf, np.inf), sampled=True):
+def by_its_equations(
+    loop, times, gain=GAIN, limits=(-np.inf, np.inf), sampled=True, reading=None, rigidity=11.68
+):
     """Deflection at the sensor, current and voltage, by scipy from sine modes and the coil.
+
+    A command follows from `reading(k, w)`, with w at time k, or from w itself.
 
     States: coordinates, rates, current, integral of the error, what the sensor shows of the force.
     Where the voltage reaches its limits, and leaves them, are events at which scipy starts anew.
     """
     wave = np.arange(1, 3) * np.pi / 0.6
-    omega = wave**2 * np.sqrt(11.68 / 0.535)
+    omega = wave**2 * np.sqrt(rigidity / 0.535)
     size = np.sqrt(2 / (0.535 * 0.6))
     at_coil, at_sensor = size * np.sin(wave * PLACE), size * np.sin(wave * 0.3)
     of_force = isinstance(loop, jb.actuators.ForceLoop)
@@ -263,7 +267,9 @@ def by_its_equations(loop, times, gain=GAIN, limits=(-np.inf, np.inf), sampled=T
     history, volts = [np.zeros(7)], []
     for start, end in itertools.pairwise(times):
         first = history[-1]
-        command = -gain * at_sensor @ first[:2] if sampled else None
+        read = at_sensor @ first[:2]
+        read = read if reading is None else reading(len(history) - 1, read)
+        command = -gain * read if sampled else None
         # The voltage of the beginning period, from L I' = u - R I - K_v w'.
         volts.append(np.clip(volts_asked(start, first, command), *limits))
         history.append(until(start, end, first, command))

@@ -143,24 +143,24 @@ def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
 
 def _report_faults(case, laws, period, options: CaseOptions) -> None:
     """Report the worst peaks of the controllers under each fault."""
-    from jaxbeam.analysis.compare import compare_under_faults
+    from jaxbeam.analysis.bound.bound import Bound
+    from jaxbeam.analysis.compare import compare_under_faults, without_bound
     from jaxbeam.case.validation import check_case
 
     check_case(case)
     worst, least = compare_under_faults(case, laws, period)
-    cells = [
-        (
-            name,
-            *(
-                "-" if one is None else f"{round(one.share, 3) + 0.0:.1%}"
-                for one in of_faults.values()
-            ),
-        )
-        for name, of_faults in worst.items()
-    ]
+    bounded = isinstance(least, Bound)
+
+    def cell(one) -> str:
+        if one is None:
+            return "-"
+        return f"{round(one.share if bounded else one.reduction, 3) + 0.0:.1%}"
+
+    cells = [(name, *map(cell, of_faults.values())) for name, of_faults in worst.items()]
+    what = "share of the attainable reduction" if bounded else "reduction of the peak"
     lines = [
-        least.verdict,
-        "share of the attainable reduction, at worst, under faults that the laws do not know:",
+        least.verdict if bounded else without_bound(least),
+        f"{what}, at worst, under faults that the laws do not know:",
         *table(("controller", *next(iter(worst.values()))), cells),
     ]
     for name, of_faults in worst.items():
@@ -172,7 +172,7 @@ def _report_faults(case, laws, period, options: CaseOptions) -> None:
                 how = "it diverges" if math.isnan(one.peak) else ratio
                 lines.append(f"{name}, {fault}{one.at and f' ({one.at})'}: {how}")
     options.report(
-        _bound_to_dict(least)
+        (_bound_to_dict(least) if bounded else _uncontrolled_to_dict(least))
         | {
             "faults": {
                 name: {fault: one and one._asdict() for fault, one in of_faults.items()}
@@ -203,10 +203,7 @@ def _read_controllers(path: Path, case: "jb.Case", files: tuple[Path, ...]) -> d
 
 def _to_dict(comparison: "Comparison") -> dict:
     """Numbers of a comparison by their names in JSON (SI units)."""
-    import numpy as np
-
-    without = float(np.max(comparison.uncontrolled.peak_deflection))
-    none = {"uncontrolled_peak": without, "least_peak": None, "held_for": None}
+    none = _uncontrolled_to_dict(comparison.uncontrolled)
     return (_bound_to_dict(comparison.bound) if comparison.bound else none) | {
         "headline": comparison.headline,
         "controllers": {
@@ -226,6 +223,12 @@ def _bound_to_dict(bound: "Bound") -> dict:
         "least_peak": bound.peak,
         "held_for": bound.period,
     }
+
+
+def _uncontrolled_to_dict(uncontrolled) -> dict:
+    """Numbers in place of those of a bound, of a run without control."""
+    without = float(max(uncontrolled.peak_deflection))
+    return {"uncontrolled_peak": without, "least_peak": None, "held_for": None}
 
 
 def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
