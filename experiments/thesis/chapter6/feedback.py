@@ -17,6 +17,7 @@ from experiments.thesis.cases import (
     GAIN,
     MASSES,
     ONE_SPAN_CUTOFF,
+    PERIOD,
     TWO_SPAN_CUTOFF,
     reduction,
     simulate_changes,
@@ -50,8 +51,10 @@ LINEAR_GAINS = 1.0, 2.0, 4.0  # V/mm
 
 def run(load_rig) -> ExperimentResult:
     """Peaks without control and under both laws, on rigs B and C."""
-    one, one_figures, remarks = _one_span(load_rig("B"))
-    two, two_figures = _two_spans(load_rig("C"))
+    rigs = (load_rig(name) for name in ("B", "C"))
+    one_span, two_spans = (with_duration(rig, rig.run.duration, 1 / PERIOD) for rig in rigs)
+    one, one_figures, remarks = _one_span(one_span)
+    two, two_figures = _two_spans(two_spans)
     return ExperimentResult((*two, *one), two_figures | one_figures, remarks)
 
 
@@ -162,13 +165,8 @@ def _tables(case: jb.Case, damping: float, delay: float | None):
         for power in LAWS.values()
     ]
     down, up = (
-        np.array(
-            [
-                [1e3 * np.max(sign * np.asarray(one.deflection), axis=0) for one in row]
-                for row in records
-            ]
-        )
-        for sign in (-1, 1)
+        np.array([[sign * 1e3 * np.asarray(getattr(one, name)) for one in row] for row in records])
+        for sign, name in ((-1, "smallest"), (1, "largest"))
     )
     (free, linear, cubic), rise = np.moveaxis(down, 2, 1), up[..., 1]
     amplifier = float(case.actuators[0].amplifier_gain)
