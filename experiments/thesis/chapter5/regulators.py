@@ -27,7 +27,7 @@ STATE_WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, a
 COMMAND_WEIGHT = 9e-5  # R
 PRINTED_STATES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # fraction of each state that is fed back
 ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
-STEPS_PER_SAMPLE = {jb.Shaker: 2, jb.Electrodynamic: 6}
+STEPS_PER_SAMPLE = {jb.Shaker: 1, jb.Electrodynamic: 2}
 SENSOR = 1  # at 0.25 m
 NO_CONTROL = "no control"
 LAWS = {
@@ -175,7 +175,8 @@ def _regulated_plan(case: jb.Case) -> IntegrationPlan:
     """Integration plan of a run, with the steps of its shaker in each sample.
 
     Far fewer than the search takes for the time constant of a coil, which it follows, though the
-    steps are exact for the shaker: they agree to ten digits.
+    steps are exact for the shaker: peaks of bounded loops differ by 4e-8 at most from those with
+    two and three times as many.
     """
     steps = STEPS_PER_SAMPLE[type(case.actuators[0])]
     plan = plan_with_steps(case, steps)
