@@ -215,6 +215,44 @@ def test_signals_are_named_with_units(system):
     assert state_space(CASE, "sine").states[0] == ("a_1", "m")
 
 
+def test_states_of_vehicles_and_absorbers_have_names_and_units():
+    """By the number of their load, of the vehicle in a row, and of the absorber."""
+    wagon = jb.vehicles.Wagon(
+        body_mass=1.0,
+        body_inertia=1.0,
+        bogie_mass=0.2,
+        bogie_inertia=0.1,
+        wheelset_mass=0.1,
+        primary_stiffness=900.0,
+        primary_damping=1.0,
+        secondary_stiffness=300.0,
+        secondary_damping=1.0,
+        bogie_distance=0.3,
+        wheelset_distance=0.1,
+        count=2,
+        spacing=0.6,
+        speed=1.0,
+    )
+    absorbers = [jb.Absorber(x, mass=0.01, frequency=20.0, damping_ratio=0.1) for x in (0.2, 0.4)]
+    loads = [jb.MovingForce(force=1.0, speed=1.0), wagon, jb.Oscillator(0.1, 400.0, 0.1, speed=1.0)]
+    case = jb.Case(BEAM, loads=loads, absorbers=absorbers, run=jb.Run(1.0))
+    system = state_space(case).at(0.1)
+    parts = "body", "front_bogie", "rear_bogie"
+    own = [f"{part}{way}" for part in parts for way in ("", "_pitch")]
+    groups = [[f"load_1_vehicle_{i}_{name}" for name in own] for i in (1, 2)]
+    groups += [["load_2_body"], ["absorber_0_body"], ["absorber_1_body"]]
+    names = [f"{name}{rate}" for group in groups for rate in ("", "_rate") for name in group]
+    units = ["rad" if "pitch" in name else "m" for name in names]
+    units = [f"{u}/s" if n.endswith("rate") else u for n, u in zip(names, units, strict=True)]
+    assert [tuple(s) for s in system.states[6:]] == list(zip(names, units, strict=True))
+    at = {signal.name: i for i, signal in enumerate(system.states)}
+    for name in (name for group in groups for name in group):
+        assert_array_equal(np.flatnonzero(system.A[at[name]]), at[f"{name}_rate"])
+    # Heights of the body of the oscillator and of absorbers: on springs with their own frequency.
+    for name, stiffness in (("load_2_body", 400.0 / 0.1), ("absorber_1_body", (40 * np.pi) ** 2)):
+        assert_allclose(-system.A[at[f"{name}_rate"], at[name]], stiffness, rtol=1e-12)
+
+
 def test_mat_file_has_matrices_names_and_units(system, tmp_path):
     path = tmp_path / "plant.mat"
     frozen = system.at(0.1)
