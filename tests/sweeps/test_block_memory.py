@@ -35,10 +35,24 @@ def plan_of(case, memory, histories=False):
     return sweep_specification(case, SPEEDS, False, histories, 1e-7, "double", memory)
 
 
-@pytest.mark.parametrize("beam", [UNIFORM, TAPERED], ids=["uniform", "tapered"])
-@pytest.mark.parametrize(("quantity", "count"), [("moment", 30), ("deflection", 40)])
-def test_forces_take_no_more_memory_than_counted(beam, quantity, count):
+MANY_MODES = dataclasses.replace(UNIFORM, modes=20)
+
+
+@pytest.mark.parametrize(
+    ("beam", "quantity", "count", "duration"),
+    [
+        (UNIFORM, "moment", 30, 3.0),
+        (TAPERED, "moment", 30, 3.0),
+        (UNIFORM, "deflection", 40, 3.0),
+        (TAPERED, "deflection", 40, 3.0),
+        (MANY_MODES, "deflection", 3, 30.0),  # vibrates freely in most of its steps
+    ],
+    ids=["moment-30-uniform", "moment-30-tapered"]
+    + ["deflection-40-uniform", "deflection-40-tapered", "free vibration"],
+)
+def test_forces_take_no_more_memory_than_counted(beam, quantity, count, duration):
     case = case_of(beam, TRAIN, quantity, count)
+    case = dataclasses.replace(case, run=jb.Run(duration))
     large, small = (plan_of(case, memory).runner(False) for memory in ("8 GB", "1 kB"))
     assert large.block_runs == 12 <= FORCE_BLOCK_RUNS and small.block_runs == 1
     runs = np.arange(12)
