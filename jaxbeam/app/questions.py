@@ -90,7 +90,7 @@ def report(record: "jb.Record") -> str:
     )
     forces = zip(content["lowest_contact_force"], content["largest_contact_force"], strict=True)
     rows = [(str(i), number(low), number(high)) for i, (low, high) in enumerate(forces)]
-    wheels = ReportTable(("wheel", "lowest contact force (N)", "largest (N)"), rows)
+    wheels = ReportTable(("wheel", "lowest on the beam (N)", "largest at samples (N)"), rows)
     parts = case_to_dict(record.case)
     entries = [(key, _short(value)) for key, value in parts.items() if key != "title"]
     picture = ReportFigure("histories of the run", plot_record(record), embedded=True)

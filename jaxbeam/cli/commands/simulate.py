@@ -111,8 +111,8 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
             )
             for i, name in names.items()
         ]
-    forces = ("static load (N)", "lowest contact force (N)", "largest (N)")
-    header = ("load", *forces, "unloading")
+    forces = ("static load (N)", "lowest on the beam (N)", "largest at samples (N)")
+    header = ("load", *forces, "unloading in the run")
     return table(header, rows)
 
 
