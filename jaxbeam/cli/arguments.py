@@ -104,10 +104,10 @@ def _range_values(text: str, value: str) -> list[Any]:
         )
     import numpy as np
 
-    from jaxbeam.sweeps import MAX_RUNS
+    from jaxbeam.sweeps import MAX_VALUES
 
-    if limits[2] > MAX_RUNS:
-        raise UsageError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
+    if limits[2] > MAX_VALUES:
+        raise UsageError(f"--over {text}: a range may have {MAX_VALUES:.0e} values, no more")
     return np.linspace(limits[0], limits[1], int(limits[2])).tolist()
 
 

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.spectra import profiles_of_runs
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.runtime.progress import ProgressBar
-from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
+from jaxbeam.sweeps import MAX_RUNS, MAX_WORDS, store as sweep_store
 from jaxbeam.sweeps.batches import PROFILE_NUMBER
 from jaxbeam.sweeps.computation import compute_sweep, worst_runs
 from jaxbeam.sweeps.quality import estimated_errors
@@ -158,6 +159,11 @@ def word_sweep(
     if paired:
         raise ValueError(
             f"words at {', '.join(words)} are combined with all numbers; they cannot be paired"
+        )
+    if (combinations := math.prod(map(len, words.values()))) > MAX_WORDS:
+        raise ValueError(
+            f"{combinations:.1e} combinations of words and counts at {', '.join(words)} are more"
+            f" than {MAX_WORDS:.0e}, as each is a case of its own: split the sweep"
         )
     cases, sweeps = [], []
     for combination in itertools.product(*words.values()):

@@ -73,6 +73,7 @@ REFUSED = [
     ("sweep case.toml", "sweep needs --over: ADDRESS=START"),
     ("sweep case.toml --over loads.0.speed=1:2", "a range is START:STOP:COUNT, such as 0.3:10:64"),
     ("sweep case.toml --over loads.0.speed=1:2:0.5", "a range is START:STOP:COUNT"),
+    ("sweep case.toml --over loads.0.speed=1:2:1000000000", "a range may have 1e+07 values"),
     ("sweep case.toml --over loads.0.speed=1,x", "--over loads.0.speed=1,x: 'x' is not a number"),
     (
         "sweep case.toml --over loads.0.speed=1,2 --over loads.0.speed=1,2",
