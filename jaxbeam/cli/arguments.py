@@ -12,6 +12,7 @@ from jaxbeam.files.endings import check_ending
 if TYPE_CHECKING:
     from jaxbeam.case.case import Case
 
+MAX_POINTS = 10**6  # of a grid of frequencies or a table
 Bounds = tuple[float, float] | tuple[str, str]  # in SI units, or texts with units
 
 
@@ -143,17 +144,25 @@ def stationary_mass(text: str) -> tuple[float, float]:
     return numbers[0], numbers[1]
 
 
+def check_points(points: int) -> None:
+    """Check the number of points of a grid or a table.
+
+    Raises UsageError unless it is from 2 to MAX_POINTS.
+    """
+    if not 2 <= points <= MAX_POINTS:
+        raise UsageError(f"--points must be from 2 to {MAX_POINTS:.0e}; it is {points}")
+
+
 def frequency_grid(start: float, stop: float, points: int) -> list[float]:
     """Frequencies (Hz) from start to stop, logarithmically spaced.
 
-    Raises UsageError unless 0 < start < stop, and for fewer than two points.
+    Raises UsageError unless 0 < start < stop, and 2 <= points <= MAX_POINTS.
     """
     if not 0 < start < stop < math.inf:
         raise UsageError(
             f"--from and --to must increase from above 0 Hz; they are {start:g}, {stop:g}"
         )
-    if points < 2:
-        raise UsageError(f"--points must be 2 or more; it is {points}")
+    check_points(points)
     import numpy as np
 
     return np.geomspace(start, stop, points).tolist()

@@ -118,7 +118,7 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --method fdd", "method 'fdd' is gone: other methods find more modes"),
         (f"node.csv {COLUMNS} --force b", "channel 'b' is in g, which is no force"),
         (f"node.csv {COLUMNS} --force a --method data", "used by method 'plscf', not by 'data'"),
-        (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),
+        (f"node.csv {COLUMNS} --order 2", "the highest order must be from 4 to 1000, not 2"),
         (f"node.csv {COLUMNS} --free beam.length", "--case and --free belong together"),
         (f"node.csv {COLUMNS} -o out.toml", "-o writes the fitted case: give --case"),
         (f"node.csv {COLUMNS} --rate 100", "the log has a column of times, 't'"),

@@ -159,7 +159,11 @@ def test_one_speed_for_all_loads():
         ({"loads.0.train": ["LM71-axles", 3]}, {}, "words or of numbers, not both"),
         ({"loads.0.speed": ["fast"]}, {}, "takes a list of numbers"),
         (OVER, {"paired": True}, "cannot be paired"),
-        ({"run.seed": range(200_000)}, {}, r"2.0e\+05 combinations of words and counts at run.seed"),
+        (
+            {"run.seed": range(200_000)},
+            {},
+            r"2.0e\+05 combinations of words and counts at run.seed",
+        ),
         (OVER | {"loads.0.sped": [1.0]}, {}, "with loads.0.train = LM71-axles: the case has no"),
         ({"loads.0.speed": [1.0], "loads.*.speed": [2.0]}, {}, "loads.0.speed is swept twice"),
         ({"loads.*.force": [1.0]}, {}, "loads.0 has no force"),

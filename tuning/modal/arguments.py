@@ -10,6 +10,7 @@ from tuning.modal.result import IdentifiedMode
 
 KINDS = ("free decay", "ambient")
 DECAY = "decay"  # the method for free decays; the others are for responses to broadband forces
+MOST_ORDER = 1000  # of a model, the work for which grows with its fourth power
 METHODS = (DECAY, "covariance", "data", "plscf")  # the last is for measured forces
 
 
@@ -26,8 +27,9 @@ class ModalSettings:
     the force is taken for zero. Readings that a logger repeats are decimated, and zeros before a
     sensor has answered interpolated, but with samples `as_logged`.
 
-    Raises ValueError for a count below one, an order below four, frequencies to choose that are not
-    positive, and a choice with a count or excluded frequencies, as it chooses all modes.
+    Raises ValueError for a count below one, an order below four or above MOST_ORDER, frequencies
+    to choose that are not positive, and a choice with a count or excluded frequencies, as it
+    chooses all modes.
 
         >>> ModalSettings(count=3, exclude=[50.0]).count
         3
@@ -48,8 +50,8 @@ class ModalSettings:
     def __post_init__(self):
         if self.count is not None and self.count < 1:
             raise ValueError(f"count must be at least 1, not {self.count}")
-        if self.order is not None and self.order < 4:
-            raise ValueError(f"the highest order must be at least 4, not {self.order}")
+        if self.order is not None and not 4 <= self.order <= MOST_ORDER:
+            raise ValueError(f"the highest order must be from 4 to {MOST_ORDER}, not {self.order}")
         wrong = [frequency for frequency in self.choose if not 0 < frequency < float("inf")]
         if wrong:
             raise ValueError(f"modes are chosen by frequencies above 0 Hz, not {wrong[0]:g} Hz")

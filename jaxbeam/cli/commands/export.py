@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from jaxbeam.cli.arguments import refuse_option
+from jaxbeam.cli.arguments import check_points, refuse_option
 from jaxbeam.cli.options import CaseOptions
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def export(
         not (is_program or is_unit) and output.suffix not in GAIN_FILES,
         f"gains are written to {endings}, programs to .c and units to .fmu, not to {output}",
     )
+    check_points(points)
     refuse_option(part is not None and not is_unit, "--part is that of a unit, NAME.fmu")
     files = [output.with_name(output.stem + ending) for ending in PROGRAM_FILES]
     options.check_outputs(*(files if is_program else [output]))

@@ -186,7 +186,8 @@ def test_poles_that_the_criteria_reject_are_modes_if_they_are_chosen():
     ("options", "message"),
     [
         ({"count": 0}, "count must be at least 1"),
-        ({"order": 3}, "the highest order must be at least 4, not 3"),
+        ({"order": 3}, "the highest order must be from 4 to 1000, not 3"),
+        ({"order": 10**9}, "the highest order must be from 4 to 1000, not 1000000000"),
         ({"force_window": -1.0}, "the force window must last longer than 0 s, not -1 s"),
         ({"choose": [0.0]}, "by frequencies above 0 Hz, not 0 Hz"),
         ({"choose": [3.0], "count": 1}, "leave out count"),
