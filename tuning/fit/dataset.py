@@ -152,14 +152,14 @@ class ChannelResiduals:
 def whiteness_p_value(residual: Float[np.ndarray, " time"]) -> float:
     """p-value of the whiteness test of Ljung and Box (1978).
 
-    Q = n (n + 2) sum r_k^2 / (n - k) over the first lags k, against chi-square.
+    Q = n (n + 2) sum r_k^2 / (n - k) over the first lags k, against chi-square. The mean is not
+    taken off: that of white noise is zero, and a residual about another one is what a model misses.
     """
-    centred = residual - residual.mean()
-    count = centred.size
+    count = residual.size
     lags = range(1, min(LJUNG_BOX_LAGS, count // 4) + 1)
-    if float(centred @ centred) == 0.0 or not lags:
+    if float(residual @ residual) == 0.0 or not lags:
         return 1.0
-    correlations = np.array([autocorrelation(centred, lag) for lag in lags])
+    correlations = np.array([autocorrelation(residual, lag) for lag in lags])
     statistic = count * (count + 2) * np.sum(correlations**2 / (count - np.array(lags)))
     return float(chi2.sf(statistic, len(lags)))
 

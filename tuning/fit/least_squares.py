@@ -43,9 +43,9 @@ class Uncertainty:
     unidentifiable: list[dict[str, float]]
 
 
-def autocorrelation(centred: Float[np.ndarray, " time"], lag: int) -> float:
-    """Autocorrelation, at a lag of so many samples, of a series whose mean is zero."""
-    return float(centred[:-lag] @ centred[lag:]) / float(centred @ centred)
+def autocorrelation(series: Float[np.ndarray, " time"], lag: int) -> float:
+    """Autocorrelation about zero, at a lag of so many samples."""
+    return float(series[:-lag] @ series[lag:]) / float(series @ series)
 
 
 def autocorrelation_factor(residuals: Float[np.ndarray, " time"]) -> float:

@@ -69,7 +69,8 @@ def test_whiteness_of_known_noise():
     p_values = [whiteness_p_value(rng.normal(size=400)) for _ in range(300)]
     assert np.mean(np.array(p_values) < 0.1) == pytest.approx(0.1, abs=0.05)
     walk = np.convolve(rng.normal(size=400), np.ones(3) / 3, mode="valid")
-    assert whiteness_p_value(walk) < 1e-9 and whiteness_p_value(np.ones(50)) == 1.0
+    assert whiteness_p_value(walk) < 1e-9 and whiteness_p_value(np.zeros(50)) == 1.0
+    assert whiteness_p_value(rng.normal(size=400) + 0.8) < 1e-9  # about an offset that a fit misses
 
 
 def test_no_remarks_on_the_residuals_of_a_good_fit(plain):
