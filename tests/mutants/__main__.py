@@ -26,7 +26,10 @@ from typing import NamedTuple
 
 FOLDER, ROOT = Path(__file__).parent, Path(__file__).parents[2]
 LARGEST_SHARE = 0.1  # of mutants that may survive
-COPIED = "jaxbeam", "tuning", "experiments", "tests", "examples", "docs", "pyproject.toml"
+COPIED = (
+    *("jaxbeam", "tuning", "experiments", "tests", "examples", "docs"),
+    *("pyproject.toml", "hatch_build.py"),
+)
 # Operators that change numbers or branches; others change what is no code of the library's own.
 ARITHMETIC = ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Mul_Add", "Pow_Mul")
 COMPARISONS = ("Lt_LtE", "LtE_Lt", "Gt_GtE", "GtE_Gt", "Lt_GtE", "Gt_LtE", "Eq_NotEq")
