@@ -7,8 +7,11 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.integrator.peaks import RunningPeaks
+from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.model.modal_model import modal_model
+from jaxbeam.simulation.errors import interpolation_errors
 from jaxbeam.simulation.integration_plan import AMPLIFICATION
 
 TIGHT = 1e-9
@@ -213,3 +216,24 @@ def test_errors_are_stored(tmp_path):
     np.testing.assert_array_equal(
         jb.read_record(tmp_path / "run.nc").step_errors, record.step_errors
     )
+
+
+@pytest.mark.parametrize("half_phase", [0.5, 1.0, 2.0, 4.0])
+def test_errors_of_interpolants_are_stated_at_1_4_to_2_8_of_their_size(half_phase):
+    """Of cos(z s + c), a mode that turns by 2 z in a step, by its interpolant at 2001 positions."""
+    model = modal_model(jb.Case(jb.Beam(0.6, 11.68, 0.535, modes=1)))
+    length = 2 * half_phase / float(model.modes.angular_frequencies[0])
+    nodes, c = 2 * np.array(PEAK_NODES) - 1, np.linspace(0.0, np.pi, 37)
+    samples = np.cos(half_phase * nodes[:, None] + c)
+    none, alone = np.zeros((1, 37)), np.zeros((0, 37))
+    found = RunningPeaks(
+        *(none, samples[:, None], none, np.full((1, 37), length)),
+        *(alone, alone, np.ones(37, bool), abs),
+    )
+    s = np.linspace(-1.0, 1.0, 2001)
+    polynomials = np.linalg.solve(np.vander(nodes), samples)
+    true = np.max(
+        np.abs(np.vander(s, nodes.size) @ polynomials - np.cos(half_phase * s[:, None] + c)), axis=0
+    )
+    ratios = np.asarray(interpolation_errors(model, found))[0] / true
+    assert np.min(ratios) >= 1.4 and np.max(ratios) <= 2.8
