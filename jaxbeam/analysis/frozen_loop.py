@@ -34,7 +34,7 @@ from jaxbeam.model.sensor_signals import (
 from jaxbeam.model.state_space import Plant, StateSpace, build_plant
 from jaxbeam.numerics.stages import propagate
 from jaxbeam.runtime.arrays import Array, Module, any_jax, ravel_pytree, to_numpy, xp
-from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 STEP = 2.0**20  # of each argument; exact in floating point, and far above the value at zero
 TRIAL_SIZES = 1e-6, 1.0, 1e6  # of random arguments at which an affine function is one
@@ -324,12 +324,10 @@ class LoopDynamics(Module):
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """Loop dynamics of a case that has a controller; may be traced and batched."""
-    controller = case.controller
-    continuous = controller.period is None and not controller.open_loop
-    build = _compiled_dynamics if continuous else _direct_dynamics
-    return to_numpy(build(case, compiled_modal_model(case, layout)))
+    return to_numpy(_loop_dynamics(case, compiled_modal_model(case, layout)))
 
 
+@compiled_if_traced
 def _loop_dynamics(case, model):
     plant = build_plant(case, model)
     law = case.controller.law(plant)
@@ -337,9 +335,6 @@ def _loop_dynamics(case, model):
     augmented_model, output_rows = with_sensor_filters(plant, filters)
     augmented_plant = eqx.tree_at(lambda m: m.modal_model, plant, augmented_model)
     return LoopDynamics(plant, augmented_plant, output_rows, law)
-
-
-_compiled_dynamics, _direct_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
 
 
 def frozen_loads(loads: LoadSet, length, t) -> LoadSet:
