@@ -72,13 +72,15 @@ def with_sensors(case: jb.Case, *positions: float, duration: float) -> jb.Case:
 def plan_with_steps(case: jb.Case, steps: int) -> IntegrationPlan:
     """Plan of a controlled run with a number of steps from event to event, known to suffice.
 
-    That of a run without control is searched for. A search in a loop that is compiled compiles it
-    once more, and numbers of steps that differ do.
+    Its error, PEAK_TOLERANCE, is that of peaks too, which no run then estimates. That of a run
+    without control is searched for. A search in a loop that is compiled compiles it once more, and
+    numbers of steps that differ do.
     """
     if case.controller is None:
         return integration_plan(case, None, PEAK_TOLERANCE)
     schedule = loop_schedule(case, sample_times(case), float(case.run.duration))
-    return IntegrationPlan(static_shapes(case), steps, 0, False, PEAK_TOLERANCE, schedule, True)
+    parts = static_shapes(case), steps, 0, False, PEAK_TOLERANCE, schedule, True
+    return IntegrationPlan(*parts, of_peaks=True)
 
 
 def critical_speed(case: jb.Case) -> float:
