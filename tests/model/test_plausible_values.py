@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from jaxbeam.model.modes import modes
 from jaxbeam.model.plausibility import loads, structure
 from jaxbeam.model.plausibility.facts import Facts, plausible_numbers
-from tests.model.test_plausibility import BASES, changed, parsed
+from tests.model.test_plausibility import BASES, BUMP, changed, parsed
 
 G = 9.81
 
@@ -352,6 +352,9 @@ VALUES = [
         {"profile.wavelength": 40.0},
         {"profile.wavelength": 0.002 * RATE_OF_WAVES**2 / G},
     ),
+    ("bump_under_loads", "cars", {"profile": BUMP}, {"profile.start": 1.0}),
+    ("bump_under_loads", "cars", {"profile": BUMP | {"height": 0.0}}, {"profile.start": 0.0}),
+    ("bump_under_loads", "cars", {"profile": BUMP | {"start": 1.0, "end": 2.0}}, {}),
     ("largest_phase", "cars", {"profile.phase": -1.5}, {"profile.phase": 1.5}),
     # Sensors, controller, run
     (
@@ -418,7 +421,8 @@ VALUES = [
     ("samples_of_record", "bridge", {}, {"run.sample_rate": 1000 / BRIDGE.first}),
     ("samples_of_record", "railway", {}, {"run.sample_rate": 1000 / (9 * BRIDGE.first)}),
     ("samples_of_force", "footbridge", {}, {"loads.1.frequencies": 500.0}),
-    ("gravity", "bridge", {"run.gravity": 1.62}, {"run.gravity": 1.62}),
+    ("gravity", "bridge", {"run.gravity": 0.6}, {"run.gravity": 0.6}),
+    ("gravity", "bridge", {"run.gravity": 0.0}, {}),
 ]
 
 
