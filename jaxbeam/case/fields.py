@@ -160,7 +160,7 @@ class TracedNumberError(jax.errors.ConcretizationTypeError):
     def __init__(self, what: str, why: str):
         sentence = (
             f"{what} is traced by jax.jit, vmap or another transformation and must be a concrete"
-            f" number: {why}"
+            f" number: {why}; keep it out of the transformation"
         )
         TypeError.__init__(self, sentence)
 

@@ -217,7 +217,8 @@ def _mapped(equations: "_Equations", constants, name: str, numbers: list) -> lis
     @values.def_vmap
     def _(_, batched, numbers):
         mapped = tuple(0 if is_batched else None for is_batched in batched[0])
-        found = _program_of(equations, name, 0, True, mapped)(constants, numbers)
+        outermost = not _is_tracing(numbers)  # of nested `vmap`, the others are within its program
+        found = _program_of(equations, name, 0, outermost, mapped)(constants, numbers)
         return found, [True] * len(found)
 
     return values(numbers)

@@ -1,19 +1,32 @@
 """Simulator of one case, prepared once and called with many values of some of its numbers."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.runtime.arrays import Array, Module, any_traced, xp
+from jaxbeam.runtime.arrays import Module, any_traced, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import plan_of_peaks, simulate_planned
-from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan, within
+from jaxbeam.simulation.varied_plan import Range, declared_ranges, varied_plan, within
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Prepared:
+    """What a simulator prepares: concrete numbers, whatever transformation it is given to.
+
+    Compared by identity, so that it is a static part of programs.
+    """
+
+    case: Case
+    ranges: dict[str, Range]
+    plan: IntegrationPlan
+    times: np.ndarray | None
 
 
 class Simulator(Module):
@@ -23,12 +36,14 @@ class Simulator(Module):
     from half to twice the number of the case. Time steps are chosen once, for the middle and the
     ends of the ranges; the error that a record states is the largest of those runs. Called with
     values, as a mapping or in the order of `vary`, it returns the record of `jaxbeam.simulate`,
-    under `jit`, `vmap`, `grad`, `jvp`, `hessian`, `lax.map` and inside `scan` too. Whatever does
-    not depend on traced values is computed in NumPy. `record.result` tells what is wrong with a
+    under `jit`, `vmap`, `grad`, `jvp`, `hessian`, `lax.map` and inside `scan` too, also where it is
+    an argument of them: it has no numbers that they trace. Whatever does not depend on traced
+    values is computed in NumPy. `record.result` tells what is wrong with a
     run (see `jaxbeam.simulation.record.Result`).
 
     Raises ValueError for an invalid case, unknown addresses, ranges in which positions change their
-    order, and when called outside of transformations with values beyond their ranges.
+    order, when called with too few or too many values, and outside of transformations with values
+    beyond their ranges.
 
     >>> import jax, jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -40,10 +55,7 @@ class Simulator(Module):
     2.00 mm
     """
 
-    case: Case
-    ranges: dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
-    plan: IntegrationPlan
-    times: Float[Array, " time"] | None
+    prepared: _Prepared = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
     def __init__(self, case: Case, vary: Any = (), times=None, tolerance: float = TOLERANCE):
@@ -53,32 +65,38 @@ class Simulator(Module):
                 " is given: make it outside of jax.jit, vmap and grad, and call it with the traced"
                 " values"
             )
-        self.case, self.tolerance = case, float(tolerance)
-        self.times = None if times is None else np.asarray(times, float)
-        self.ranges = declared_ranges(case, vary)
-        timing = [
-            a for a in self.ranges if times is None and a in ("run.duration", "run.sample_rate")
-        ]
+        times = None if times is None else np.asarray(times, float)
+        ranges = declared_ranges(case, vary)
+        timing = [a for a in ranges if times is None and a in ("run.duration", "run.sample_rate")]
         if timing:
             raise ValueError(f"{timing[0]} fixes the number of samples: give times if it varies")
-        self.plan = varied_plan(case, self.ranges, self.times, self.tolerance, plan_of_peaks)
+        self.tolerance = float(tolerance)
+        plan = varied_plan(case, ranges, times, self.tolerance, plan_of_peaks)
+        self.prepared = _Prepared(case, ranges, plan, times)
 
     def __call__(self, values: Mapping[str, Any] | Any = ()) -> Record:
         """Record for some values in SI units, by address or in the order of the addresses."""
+        case, ranges = self.prepared.case, self.prepared.ranges
         if not isinstance(values, Mapping):
             listed = isinstance(values, list | tuple) or xp.ndim(values) > 0
-            values = values if listed else [values]
-            values = dict(zip(self.ranges, values, strict=True))
-        unknown = [address for address in values if address not in self.ranges]
+            values = list(values) if listed else [values]
+            if len(values) != len(ranges):
+                raise ValueError(
+                    f"give as many values as numbers vary, {len(ranges)} ({', '.join(ranges)}),"
+                    f" not {len(values)}"
+                )
+            values = dict(zip(ranges, values, strict=True))
+        unknown = [address for address in values if address not in ranges]
         if unknown:
-            raise ValueError(f"{unknown[0]} does not vary: it is none of {', '.join(self.ranges)}")
-        case = replace(self.case, values)
-        inside = within(case, self.ranges)
+            raise ValueError(f"{unknown[0]} does not vary: it is none of {', '.join(ranges)}")
+        case = replace(case, values)
+        inside = within(case, ranges)
         if is_concrete(inside) and not concrete(inside):
-            named = {a: both for a, both in self.ranges.items() if not within(case, {a: both})}
+            named = {a: both for a, both in ranges.items() if not within(case, {a: both})}
             address, (low, high) = next(iter(named.items()))
             raise ValueError(
                 f"{address} is out of the range for which the steps were chosen, {low} to {high}:"
                 f" give jb.Simulator a wider one"
             )
-        return simulate_planned(case, self.plan, self.times, self.tolerance, inside)
+        plan, times = self.prepared.plan, self.prepared.times
+        return simulate_planned(case, plan, times, self.tolerance, inside)

@@ -74,7 +74,8 @@ def declared_ranges(case: Case, vary) -> dict[str, Range]:
         if both is None:
             ends = value / MARGIN, value * MARGIN
         else:
-            ends = tuple(np.broadcast_to(np.asarray(end, float), value.shape) for end in both)
+            given_ends = both if isinstance(both, list | tuple) or np.ndim(both) else ()
+            ends = tuple(np.broadcast_to(np.asarray(end, float), value.shape) for end in given_ends)
             if len(ends) != 2 or not np.all(ends[0] <= ends[1]):
                 raise ValueError(f"the range of {address} must be (low, high), not {both}")
         ranges[address] = np.minimum(*ends), np.maximum(*ends)

@@ -1,5 +1,6 @@
 """Runs inside of transformations: prepared once, or as they come, without a plan."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,6 +81,30 @@ def test_second_derivatives_are_those_of_a_peak_that_moves(varied):
     assert_allclose(found, central(jax.grad(peak), np.ones(len(varied)), 1e-3), rtol=1e-5)
 
 
+def test_a_simulator_may_be_an_argument_of_transformations():
+    """Its numbers were traced, and `jax.jit` could not hash them."""
+    expected = SIMULATOR([0.2]).peak_deflection
+    assert_allclose(jax.jit(SIMULATOR)([0.2]).peak_deflection, expected, rtol=1e-12)
+    peak = eqx.filter_jit(lambda simulator, mass: simulator([mass]).peak_deflection)
+    assert_allclose(peak(SIMULATOR, 0.2), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("prepared", [True, False])
+def test_a_vmap_within_a_vmap_gives_the_runs_of_all_pairs(prepared):
+    """The outer number was converted to NumPy."""
+    simulator = jb.Simulator(CASE, {MASS: (0.1, 0.4), "loads.0.speed": (1.0, 3.0)})
+
+    def peak(mass, speed):
+        values = {MASS: mass, "loads.0.speed": speed}
+        record = simulator(values) if prepared else jb.simulate(jb.replace(CASE, values))
+        return record.peak_deflection[0]
+
+    masses, speeds = np.array([0.1, 0.3]), np.array([1.0, 2.0, 3.0])
+    found = jax.vmap(lambda m: jax.vmap(lambda v: peak(m, v))(speeds))(masses)
+    expected = [[peak(m, v) for v in speeds] for m in masses]
+    assert_allclose(found, expected, rtol=1e-6)
+
+
 def test_a_run_under_jit_says_what_is_wrong_with_it():
     result = jax.jit(lambda mass: SIMULATOR([mass]).result)
     assert jb.Result(int(result(0.2))) == jb.Result(0)
@@ -122,6 +147,10 @@ def test_wrong_uses_of_a_simulator_are_said():
         SIMULATOR({"loads.0.speed": 1.0})
     with pytest.raises(ValueError, match=r"must be \(low, high\)"):
         jb.Simulator(CASE, {MASS: (2.0, 1.0)})
+    with pytest.raises(ValueError, match=r"must be \(low, high\), not 0.3"):
+        jb.Simulator(CASE, {MASS: 0.3})
+    with pytest.raises(ValueError, match=r"as many values as numbers vary, 1 .*, not 2"):
+        SIMULATOR([0.2, 0.3])
     with pytest.raises(ValueError, match="fixes the number of samples"):
         jb.Simulator(CASE, ("run.duration",))
 
