@@ -29,7 +29,7 @@ class PlainEnvironment:
         self.transitions, self.offsets = maps.states.linear[:, 0], maps.states.offset[:, 0]
         self.rows, self.row_offsets = maps.deflections.linear[:, 0], maps.deflections.offset[:, 0]
         (self.limits,) = [one.command_limits() for one in environment.problem.case.driven]
-        self.sensors = np.asarray(environment.loop.output_rows)
+        self.sensors = np.asarray(environment.prepared.loop.output_rows)
         self.start, self.uncontrolled = np.asarray(state.plant), float(state.uncontrolled)
 
     def reset(self):

@@ -93,6 +93,23 @@ class _Event(NamedTuple):
     start: Any
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _PreparedLoop:
+    """What an environment prepares: concrete numbers, whatever transformation it is given to.
+
+    Compared by identity, so that it is a static part of programs.
+    """
+
+    case: Case
+    loop: _SteppedLoop
+    shapes: StaticShapes
+    substeps: int
+    schedule: EventSchedule
+    controls: Int[np.ndarray, " period_or_end"]  # events of the control samples
+    starts: Int[np.ndarray, "period interval"]  # first event of each interval, -1 for none
+    samples: Int[np.ndarray, "period sample"]  # events of the samples of each period
+
+
 class Environment(Module):
     """Environment of a problem: `reset` and `step` are pure functions of arrays.
 
@@ -113,14 +130,7 @@ class Environment(Module):
     """
 
     problem: BenchmarkProblem = eqx.field(static=True)
-    case: Case
-    loop: _SteppedLoop
-    shapes: StaticShapes = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
-    schedule: EventSchedule
-    starts: Int[np.ndarray, "period interval"]  # first event of each interval, -1 for none
-    controls: Int[np.ndarray, " period_or_end"]  # events of the control samples
-    samples: Int[np.ndarray, "period sample"]  # events of the samples of each period
+    prepared: _PreparedLoop = eqx.field(static=True)
 
     def __init__(self, problem: BenchmarkProblem):
         case, controller = problem.case, problem.case.controller
@@ -128,25 +138,21 @@ class Environment(Module):
         gains = np.zeros(len(case.driven))
         settings = {name: getattr(controller, name) for name in ("period", "delay", "resolution")}
         silent = Feedback(gains=gains, **settings)
+        case = dataclasses.replace(case, controller=silent)
+        schedule = loop_schedule(case, np.asarray(sample_times(case)))
+        plan = varied_plan(case, declared_ranges(case, problem.vary), None, TOLERANCE)
+        shapes = dataclasses.replace(plan.shapes, max_loads=problem.max_loads)
+        loop = closed_loop(case, shapes.layout, load_set(case, shapes.layout), schedule)
+        stepped = _SteppedLoop(**{f.name: getattr(loop, f.name) for f in dataclasses.fields(loop)})
         self.problem = problem
-        self.case = dataclasses.replace(case, controller=silent)
-        times = np.asarray(sample_times(self.case))
-        self.schedule = loop_schedule(self.case, times)
-        ranges = declared_ranges(self.case, problem.vary)
-        plan = varied_plan(self.case, ranges, None, TOLERANCE)
-        self.substeps = plan.substeps
-        self.shapes = dataclasses.replace(plan.shapes, max_loads=problem.max_loads)
-        loop = closed_loop(
-            self.case, self.shapes.layout, load_set(self.case, self.shapes.layout), self.schedule
+        self.prepared = _PreparedLoop(
+            case, stepped, shapes, plan.substeps, schedule, *_periods(schedule)
         )
-        fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop)}
-        self.loop = _SteppedLoop(**fields)
-        self.controls, self.starts, self.samples = _periods(self.schedule)
 
     @property
     def steps(self) -> int:
         """Number of steps of a run."""
-        return len(self.starts)
+        return len(self.prepared.starts)
 
     def reset(
         self, key: Any, load: Any = None
@@ -155,23 +161,28 @@ class Environment(Module):
 
         A seed or JAX key gives the noise, and the load unless its numbers are given, in the order
         and units of `BenchmarkProblem.vary`.
+
+        Raises ValueError for a key that is none, and for another number of numbers of the load.
         """
-        if not jnp.issubdtype(jnp.result_type(key), jax.dtypes.prng_key):
-            key = jax.random.key(key)
+        key, vary = _key(key), self.problem.vary
         if load is None:
             load = self.problem.numbers(
-                jax.random.uniform(jax.random.fold_in(key, LOAD_STREAM), (len(self.problem.vary),))
+                jax.random.uniform(jax.random.fold_in(key, LOAD_STREAM), (len(vary),))
             )
         load = jnp.asarray(load, float)
+        if load.shape != (len(vary),):
+            raise ValueError(
+                f"a load has {len(vary)} numbers, {', '.join(vary)}; its shape is {load.shape}"
+            )
         maps, plant = self._maps(load)
-        noise = self.loop.noise
+        noise = self.prepared.loop.noise
         if noise is not None:
             columns = [
                 jax.random.normal(jax.random.fold_in(key, i), noise.shape[:1])
                 for i in range(noise.shape[1])
             ]
             noise = jnp.stack(columns, axis=1)
-        memory = jax.tree.map(jnp.asarray, self.loop.start(1))
+        memory = jax.tree.map(jnp.asarray, self.prepared.loop.start(1))
         zero = jnp.zeros(())
         state = EnvironmentState(load, maps, noise, zero, jnp.zeros((), int), plant, memory, zero)
         state = state._replace(uncontrolled=self._peak_without_commands(state))
@@ -183,15 +194,22 @@ class Environment(Module):
         """State, observation, reward and whether the run has ended, after a period under an action.
 
         After the end of a run nothing changes any more.
+
+        Raises ValueError for an action of another shape than (commands,).
         """
-        wanted = jnp.zeros(len(self.case.actuators))
-        wanted = wanted.at[np.array(self.problem.driven)].set(jnp.asarray(action, float))
+        driven, action = np.array(self.problem.driven), jnp.asarray(action, float)
+        if action.shape != driven.shape:
+            raise ValueError(
+                f"an action is a list of {len(driven)} commands, one for each actuator that takes"
+                f" any; its shape is {action.shape}"
+            )
+        wanted = jnp.zeros(len(self.prepared.case.actuators)).at[driven].set(action)
         k = jnp.minimum(state.step, self.steps - 1)
         ended = state.step >= self.steps
         loop, memory, plant, peak = self._loop(state), state.memory, state.plant, state.peak
         memory = memory._replace(commands=loop.path.send(memory.commands, wanted[:, None]))
-        for i in range(self.starts.shape[1]):
-            event = jnp.asarray(self.starts)[k, i]
+        for i in range(self.prepared.starts.shape[1]):
+            event = jnp.asarray(self.prepared.starts)[k, i]
             memory = loop.passed(memory, plant[:, None], event, reads=i > 0)
             plant, highest = _advance(state.maps, k, i, plant, loop.path.acting(memory.commands))
             peak = jnp.maximum(peak, highest)
@@ -202,11 +220,11 @@ class Environment(Module):
         return after, observation, reward, after.step >= self.steps
 
     def _loop(self, state: EnvironmentState) -> _SteppedLoop:
-        return dataclasses.replace(self.loop, noise=state.noise)
+        return dataclasses.replace(self.prepared.loop, noise=state.noise)
 
     def _observed(self, state: EnvironmentState, period):
         """State after the samples of the sensors at the start of a period, and observation."""
-        event = jnp.asarray(self.controls)[period]
+        event = jnp.asarray(self.prepared.controls)[period]
         memory, readings = self._loop(state).read(state.memory, state.plant[:, None], event)
         parts = [readings, (state.step / self.steps)[None]]
         if self.problem.told:
@@ -214,11 +232,11 @@ class Environment(Module):
         return state._replace(memory=memory), jnp.concatenate(parts)
 
     def _peak_without_commands(self, state: EnvironmentState):
-        nothing = jnp.zeros((len(self.case.actuators), 1))
+        nothing = jnp.zeros((len(self.prepared.case.actuators), 1))
 
         def period(plant, k):
             highest = jnp.zeros(())
-            for i in range(self.starts.shape[1]):
+            for i in range(self.prepared.starts.shape[1]):
                 plant, own = _advance(state.maps, k, i, plant, nothing)
                 highest = jnp.maximum(highest, own)
             return plant, highest
@@ -227,21 +245,21 @@ class Environment(Module):
 
     def _maps(self, load) -> tuple[HeldMaps, Float[Array, " state"]]:
         """Maps of all intervals for a load, and the state at the start."""
-        case = self.problem.with_load(self.case, load)
-        layout, schedule = self.shapes.layout, self.schedule
-        loads, model = load_set(case, layout), self.loop.model
-        grid = grid_by_schedule(case, model, schedule, self.substeps)
-        discrete = discrete_model(model, grid, None, self.loop)
-        count = grid.counts.shape[0] * self.substeps
-        path = load_path(discrete, loads, self.shapes.max_loads, jnp.arange(count))
+        case = self.problem.with_load(self.prepared.case, load)
+        layout, schedule = self.prepared.shapes.layout, self.prepared.schedule
+        loads, model = load_set(case, layout), self.prepared.loop.model
+        grid = grid_by_schedule(case, model, schedule, self.prepared.substeps)
+        discrete = discrete_model(model, grid, None, self.prepared.loop)
+        count = grid.counts.shape[0] * self.prepared.substeps
+        path = load_path(discrete, loads, self.prepared.shapes.max_loads, jnp.arange(count))
         maps = step_maps(step_inputs(discrete, loads, path), vehicles_of(loads, grid.lengths))
         states, actuators = maps.states.offset.shape[-1], len(case.actuators)
         linear = jnp.asarray(maps.states.linear)[:, 0]
         held = linear[..., states:].reshape(*linear.shape[:2], NODE_COUNT, actuators).sum(axis=2)
         steps = linear[..., :states], held, jnp.asarray(maps.states.offset)[:, 0]
 
-        panels = jnp.asarray(grid.event_panels) * self.substeps  # first step of each event
-        first = self.starts[self.starts >= 0]
+        panels = jnp.asarray(grid.event_panels) * self.prepared.substeps  # first step of each event
+        first = self.prepared.starts[self.prepared.starts >= 0]
         is_first = jnp.zeros(count, bool).at[panels[first]].set(True)
         identity = jnp.eye(states, states + actuators)
 
@@ -261,8 +279,8 @@ class Environment(Module):
             last = panels[event] - 1
             return AffineMap(of_columns[last], of_one[last])
 
-        is_one = self.starts >= 0
-        ends = np.where(is_one, _next(self.starts, self.controls), 0)
+        is_one = self.prepared.starts >= 0
+        ends = np.where(is_one, _next(self.prepared.starts, self.prepared.controls), 0)
         to_ends = at(ends)
         whole = AffineMap(
             jnp.where(is_one[..., None, None], to_ends.linear, identity),
@@ -272,11 +290,13 @@ class Environment(Module):
         shapes = model.shapes(np.asarray(self.problem.positions), (0,))[0]
         rows = rows.at[:, model.coordinate_index].set(shapes)
         # A sample belongs to the interval that begins before it and ends with it or later.
-        samples = self.samples[:, None]
+        samples = self.prepared.samples[:, None]
         inside = (
-            (samples > self.starts[..., None]) & (samples <= ends[..., None]) & is_one[..., None]
+            (samples > self.prepared.starts[..., None])
+            & (samples <= ends[..., None])
+            & is_one[..., None]
         )
-        of_samples = at(self.samples)
+        of_samples = at(self.prepared.samples)
         shape = (*inside.shape, len(rows))
         linear = jnp.where(inside[..., None, None], (rows @ of_samples.linear)[:, None], 0.0)
         offset = jnp.where(inside[..., None], (of_samples.offset @ rows.T)[:, None], 0.0)
@@ -288,6 +308,22 @@ class Environment(Module):
         if vehicles is not None:
             plant = plant.at[model.state_count :].set(vehicles[:, 0])
         return HeldMaps(whole, deflections), plant
+
+
+def _key(seed) -> Any:
+    """JAX key of a seed, or of a key of either form, as `jax.random.key` or `PRNGKey` make it."""
+    seed = seed if hasattr(seed, "dtype") else np.asarray(seed)
+    kind, shape = seed.dtype, seed.shape
+    if jnp.issubdtype(kind, jax.dtypes.prng_key) and shape == ():
+        return seed
+    if kind == jnp.uint32 and shape == (2,):
+        return jax.random.wrap_key_data(seed)
+    if not jnp.issubdtype(kind, jnp.integer) or shape != ():
+        raise ValueError(
+            f"reset takes a seed, an integer, or one key of JAX; not an array of {kind} of the"
+            f" shape {shape}"
+        )
+    return jax.random.key(seed)
 
 
 def _advance(maps: HeldMaps, period, interval: int, plant, command):

@@ -40,8 +40,8 @@ def short() -> Environment:
 
 def under_law(environment: Environment, law, numbers):
     """Readings and commands (period, ...) of a run under a law, and the last state and reward."""
-    problem, case = environment.problem, environment.case
-    sensors, plant = len(case.sensors), environment.loop.plant
+    problem, case = environment.problem, environment.prepared.case
+    sensors, plant = len(case.sensors), environment.prepared.loop.plant
     count = plant.modal_model.state_count
 
     def period(carry, k):
@@ -109,7 +109,7 @@ def test_pure_under_jit_vmap_grad_and_scan(short):
     assert_allclose(of_batch, [one(reset(seed)[0], actions) for seed in seeds], rtol=1e-11)
     assert len(set(np.asarray(of_batch))) == 3  # each seed has a load of its own
     # The derivative is that of the command before rounding.
-    smooth = eqx.tree_at(lambda e: e.loop.path, short, _without_rounding(short.loop.path))
+    smooth = Environment(_without_rounding(short.problem))
     value = functools.partial(returns, smooth, reset(1)[0])
     slope = np.asarray(jax.jit(jax.grad(value))(actions))
     direction, value = np.random.default_rng(1).normal(size=actions.shape), jax.jit(value)
@@ -119,9 +119,32 @@ def test_pure_under_jit_vmap_grad_and_scan(short):
     assert np.abs(slope).max() > 0
 
 
-def _without_rounding(path):
-    controller = dataclasses.replace(path.case.controller, resolution=None)
-    return dataclasses.replace(path, case=dataclasses.replace(path.case, controller=controller))
+def _without_rounding(problem):
+    controller = dataclasses.replace(problem.case.controller, resolution=None)
+    case = dataclasses.replace(problem.case, controller=controller)
+    return dataclasses.replace(problem, case=case)
+
+
+def test_an_environment_may_be_an_argument_and_a_key_of_either_form(short):
+    """Its numbers were traced, and `jax.random.key` refused keys of the older form."""
+    reset = eqx.filter_jit(lambda environment, key: environment.reset(key))
+    expected, _ = jax.jit(short.reset)(SEED)
+    for key in (SEED, jax.random.key(SEED), jax.random.PRNGKey(SEED)):
+        assert_allclose(reset(short, key)[0].load, expected.load, rtol=1e-15)
+    static = jax.jit(lambda environment: environment.reset(SEED)[0].load, static_argnums=0)
+    assert_allclose(static(short), expected.load, rtol=1e-15)
+
+
+def test_wrong_actions_keys_and_loads_are_said(short):
+    state, _ = jax.jit(short.reset)(SEED)
+    for action in (1.0, [1.0, 2.0]):
+        with pytest.raises(ValueError, match="an action is a list of 1 commands"):
+            short.step(state, action)
+    for key in (1.5, [1, 2, 3]):
+        with pytest.raises(ValueError, match="reset takes a seed, an integer, or one key of JAX"):
+            short.reset(key)
+    with pytest.raises(ValueError, match=r"a load has 2 numbers, .*; its shape is \(1,\)"):
+        short.reset(SEED, [0.3])
 
 
 def test_noise_and_load_are_those_of_the_seed(short):
@@ -131,7 +154,7 @@ def test_noise_and_load_are_those_of_the_seed(short):
     assert_allclose(state.load, problem.test_load(SEED), rtol=1e-15)
     assert not np.allclose(state.noise, other.noise)
     case = problem.run_case(problem.test_load(SEED), SEED)
-    record = jb.simulate(dataclasses.replace(case, controller=short.case.controller))
+    record = jb.simulate(dataclasses.replace(case, controller=short.prepared.case.controller))
     sensors = len(case.sensors)
     assert_allclose(observation[:sensors], record.controller_readings[0], rtol=1e-9)
     assert observation[sensors] == 0
