@@ -22,8 +22,8 @@ from jaxbeam.model.statics import REACTION, held_positions, influence_line
 
 POSITIONS = 41  # along the beam by default, in addition to the special ones
 LINE_POINTS = 2001  # along the beam, between which influence lines are linear
-SPACINGS = 25  # values of a varied spacing, searched again between the neighbours of the best
 COARSE = 20  # points of a line between those at which an axle is tried first
+REFINED = 4  # of the places found so, those whose neighbours are tried at all points
 
 
 def load_model(name: str) -> LoadModel:
@@ -104,9 +104,10 @@ def load_model_envelope(
 
     One vehicle of the `model`, a name of `load_models` or a train of the library, stands wherever
     it is worst, in either direction, in part on the beam; its varied spacing has the worst of its
-    values. The `lane` load (N/m) lies on all parts where it is unfavourable. `allowance` is
-    added to effects of axles. Both are by default those of the model. Quantities are those of
-    `influence_line`; of what jumps at a position both sides count. The case's own loads do not.
+    values. All axles on the beam count, those that relieve too. The `lane` load (N/m) lies on all
+    parts where it is unfavourable. `allowance` is added to effects of axles. Both are by default
+    those of the model. Quantities are those of `influence_line`; of what jumps at a position both
+    sides count. The case's own loads do not.
 
     Raises ValueError as `influence_line`, for an unknown model, and for a lane load or an allowance
     below 0.
@@ -227,7 +228,8 @@ def influence_at(
     places = np.linspace(0.0, length, points)
     # Shear forces jump at the section: a point on both sides of it.
     around = x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
-    kinks = np.concatenate([np.clip(around, 0.0, length), held_positions(case)])
+    hinges = [float(concrete(hinge.position)) for hinge in case.beam.hinges]
+    kinks = np.concatenate([np.clip(around, 0.0, length), held_positions(case), hinges])
     places = np.union1d(places, kinks)
     line = influence_line(case, x, places, quantity=quantity, side=side)
     return TabulatedLine(places, np.asarray(line), kinks)
@@ -251,36 +253,78 @@ def _extremes(line: TabulatedLine, model: LoadModel, lane: float | None, factor:
 
 def _worst_place(line: TabulatedLine, vehicle: ModelVehicle) -> tuple[float, WorstPlace]:
     """Largest sum of the axle forces times the line (N times its unit), and the vehicle's place."""
-    length, best = float(line.positions[-1]), (0.0, WorstPlace("", np.zeros(0), np.nan))
+    if vehicle.between is None:
+        return _worst_rigid_place(line, vehicle, vehicle.choices or (None,))
+    low, high = vehicle.between
+    between = low, high or max(low, float(line.positions[-1]))
+    found = _worst_rigid_place(line, vehicle, between), _worst_apart(line, vehicle, *between)
+    return max(found, key=lambda one: one[0])
+
+
+def _worst_rigid_place(line: TabulatedLine, vehicle: ModelVehicle, spacings):
+    """The same for some values of the varied spacing (m), None for the vehicle's own."""
     coarse = np.concatenate([line.positions[::COARSE], line.kinks])
 
-    def search(places, values):
-        """The best of values of the spacing with an axle at each of some places, and its value."""
-        found, chosen = best, None
-        for value in values:
-            offsets = vehicle.with_spacing(value)
-            for behind in (offsets, -offsets):
-                fronts = (places[:, None] + behind).ravel()
-                total = line.at(fronts[:, None] - behind) @ vehicle.axle_forces
-                i = int(np.argmax(total))
-                if total[i] > found[0]:
-                    place = WorstPlace(vehicle.name, behind, float(fronts[i]))
-                    found, chosen = (float(total[i]), place), value
-        return found, chosen
+    def best(places, behind) -> tuple[float, WorstPlace]:
+        """The best with an axle at one of the places, of axles at distances behind the first."""
+        fronts = (places[:, None] + behind).ravel()
+        total = line.at(fronts[:, None] - behind) @ vehicle.axle_forces
+        i = int(np.argmax(total))
+        return float(total[i]), WorstPlace(vehicle.name, behind, float(fronts[i]))
 
-    values = vehicle.choices or (None,)
-    if vehicle.between is not None:
-        low, high = vehicle.between[0], vehicle.between[1] or max(vehicle.between[0], length)
-        values = np.linspace(low, high, SPACINGS)
-    best, chosen = search(coarse, values)
-    if vehicle.between is not None and chosen is not None:
-        step = (high - low) / (SPACINGS - 1)
-        values = np.linspace(max(low, chosen - step), min(high, chosen + step), SPACINGS)
-        best, chosen = search(coarse, values)
-    if not best[1].vehicle:
-        return best
+    found = []
+    for spacing in spacings:
+        offsets = vehicle.with_spacing(spacing)
+        found += [best(coarse, offsets), best(coarse, -offsets)]
     # The line is linear between its points, so that an axle is at one of them at the worst place.
-    near = best[1].first_axle - best[1].offsets
-    step = COARSE * length / line.positions.size
-    points = line.positions[np.min(np.abs(line.positions[:, None] - near), axis=1) <= 2 * step]
-    return search(points, (chosen,))[0]
+    step = COARSE * line.positions[-1] / line.positions.size
+    for _, place in sorted(found, key=lambda one: -one[0])[:REFINED]:
+        near = np.abs(line.positions[:, None] - place.first_axle + place.offsets)
+        points = line.positions[near.min(axis=1) <= 2 * step]
+        if points.size:
+            found.append(best(points, place.offsets))
+    return max(found, key=lambda one: one[0])
+
+
+def _worst_apart(line: TabulatedLine, vehicle: ModelVehicle, low: float, high: float):
+    """The same where the varied spacing is free between two values (m).
+
+    The axles before and behind it are then each at a best place of their own: one of them is at a
+    point of the line, or next to the beam.
+    """
+    length, offsets = line.positions[-1], vehicle.with_spacing(0.0)
+    split = 1 + (vehicle.varied or 0)
+    points = np.concatenate([[-1e-9 * length], line.positions, [(1 + 1e-9) * length]])
+    best = 0.0, WorstPlace("", np.zeros(0), np.nan)
+    for way in (1.0, -1.0):
+        groups = []
+        for part in (slice(None, split), slice(split, None)):
+            behind = way * (offsets[part] - offsets[part][0])
+            fronts = np.unique(points[:, None] + behind)
+            groups.append((fronts, line.at(fronts[:, None] - behind) @ vehicle.axle_forces[part]))
+        (front, ahead), (rear, after) = groups
+        last = front - way * offsets[split - 1]
+        ends = np.sort(last[:, None] - way * np.array([low, high]), axis=1)
+        start, stop = np.searchsorted(rear, ends[:, 0]), np.searchsorted(rear, ends[:, 1], "right")
+        chosen = _largest_between(after, start, stop)
+        total = np.where(start < stop, ahead + after[chosen], -np.inf)
+        i = int(np.argmax(total))
+        if total[i] > best[0]:
+            spacing = way * float(last[i] - rear[chosen[i]])
+            behind = way * vehicle.with_spacing(spacing)
+            best = float(total[i]), WorstPlace(vehicle.name, behind, float(front[i]))
+    return best
+
+
+def _largest_between(values, start, stop) -> np.ndarray:
+    """Indices of the largest of values[start:stop] for many pairs, 0 where there is none."""
+    found, size, largest = np.zeros(start.size, int), 1, np.arange(values.size)
+    counts = stop - start
+    while largest.size:  # `largest` has those of all ranges of the size
+        at = (size <= counts) & (counts < 2 * size)
+        first, second = largest[start[at]], largest[stop[at] - size]
+        found[at] = np.where(values[first] >= values[second], first, second)
+        first, second = largest[:-size], largest[size:]
+        largest = np.where(values[first] >= values[second], first, second)
+        size *= 2
+    return found

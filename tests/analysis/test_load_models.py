@@ -169,3 +169,52 @@ def test_command(tmp_path, capsys):
     assert "4.17e+06" in printed
     assert "tandem 8.8-10 m" in printed
     assert "4170000" in table.read_text()
+
+
+@pytest.mark.parametrize("x", [20.0, 9.3])
+@pytest.mark.parametrize("name", ["HL-93", "HL-93-pair", "M1600", "HB45"])
+def test_vehicles_stand_with_axles_at_a_hinge(name, x):
+    """Spans of 20 m and 15 m with a hinge 4.1 m beyond the support: lines are straight between.
+
+    So that one axle is at a kink at the worst place, for each spacing of a grid that has the worst.
+    """
+    kinks = np.array([0.0, x, 20.0, 24.1, 35.0])
+    over_support = np.array([0.0, 0.0, 0.0, -4.1, 0.0])
+    values = over_support * x / 20.0 + [0.0, x * (20.0 - x) / 20.0, 0.0, 0.0, 0.0]
+    order = np.unique(kinks, return_index=True)[1]
+    kinks, values = kinks[order], values[order]
+    expected = [0.0, 0.0]
+    for one in load_models()[name].vehicles:
+        spacings = one.choices or (None,)
+        if one.between is not None:
+            low, high = one.between[0], one.between[1] or 35.0
+            spacings = [low, *np.arange(np.ceil(20 * low), 20 * high + 1) / 20]
+        for sign, i in ((-1.0, 0), (1.0, 1)):
+            fine = np.linspace(0.0, 35.0, 350001)
+            signed = np.maximum(sign * np.interp(fine, kinks, values), 0)
+            lane = one.lane * np.trapezoid(signed, fine)
+            for spacing in spacings:
+                for behind in one.with_spacing(spacing) * np.array([[1.0], [-1.0]]):
+                    fronts = (kinks[:, None] + behind).reshape(-1, 1)
+                    found = np.interp(fronts - behind, kinks, sign * values, 0.0, 0.0)
+                    axles = (found @ one.axle_forces).max()
+                    total = (1 + load_models()[name].allowance) * axles + lane
+                    expected[i] = max(expected[i], total)
+    beam = jb.Beam(35.0, flexural_rigidity=6e9, mass_per_length=9e3, hinges=[jb.Hinge(24.1)])
+    found = load_model_envelope(jb.Case(beam, supports=[jb.Support(20.0)]), name, [x])
+    assert_allclose([-found.lowest[0], found.highest[0]], expected, rtol=1e-6, atol=10.0)
+
+
+def test_hogging_at_the_first_quarter_of_three_spans():
+    """Two trucks with any gap, of which one is off the beam: the other is at its own worst place.
+
+    Against fronts in steps of 2 mm for the gap of 30 m, which is as good as any.
+    """
+    beam = jb.Beam(47.3, flexural_rigidity=5e9, mass_per_length=8e3)
+    case = jb.Case(beam, supports=[jb.Support(19.7), jb.Support(33.1)])
+    found = load_model_envelope(case, "HL-93-pair", [8.2], lane=0.0, allowance=0.0)
+    truck = load_models()["HL-93-pair"].vehicles[0]
+    offsets, line = truck.with_spacing(30.0), influence_at(case, 8.2, "moment")
+    fronts = np.arange(20.0, 75.0, 0.002)[:, None]
+    lowest = min((line.at(fronts - way * offsets) @ truck.axle_forces).min() for way in (1, -1))
+    assert_allclose(found.lowest[0], lowest, rtol=1e-7)
