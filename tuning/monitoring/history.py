@@ -21,6 +21,7 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.progress import ProgressBar
 from tuning.logs.log import LogWarning
+from tuning.logs.readers.headings import epoch_seconds
 from tuning.logs.reading import read_log, version_of
 from tuning.modal.arguments import ModalSettings
 from tuning.modal.identify_modes import identify_modes
@@ -192,17 +193,22 @@ def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
 
 
 def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> ModeHistory:
-    """ModeHistory of entries by the time of their first samples, or else by their names."""
-    entries = list(known.values())
-    dated = all(entry.start for entry in entries if not entry.problem)
-    in_time = dated and any(entry.start for entry in entries)
+    """ModeHistory of entries by the time of their first samples, or else by their names.
 
-    def key(entry: LogModes):
+    Logs without a date that could not be analysed follow the one before them by name.
+    """
+
+    def by_name(entry: LogModes):
         numbers = re.split(r"(\d+)", entry.file)
-        natural = [(int(part), "") if part.isdigit() else (-1, part) for part in numbers]
-        return (entry.start if in_time else "", natural)
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in numbers]
 
-    return ModeHistory(tuple(sorted(entries, key=key)), settings)
+    entries = sorted(known.values(), key=by_name)
+    dates = [epoch_seconds(entry.start) for entry in entries]
+    if all(date or entry.problem for date, entry in zip(dates, entries, strict=True)):
+        for i in range(1, len(dates)):
+            dates[i] = dates[i] or dates[i - 1]
+        entries = [entries[i] for i in np.argsort(dates, kind="stable")]
+    return ModeHistory(tuple(entries), settings)
 
 
 def _analysed(
@@ -224,11 +230,12 @@ def _analysed(
 
 def entry_of(path: Path, settings: AnalysisSettings) -> LogModes:
     """LogModes of one log."""
-    mark = version_of(path)
+    mark, start = version_of(path), ""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LogWarning)
             log = read_log(path, columns=settings.columns, rate=settings.rate)
+            start = log.start
             fit = identify_modes(
                 log,
                 band=settings.band,
@@ -237,7 +244,7 @@ def entry_of(path: Path, settings: AnalysisSettings) -> LogModes:
                 settings=ModalSettings(order=settings.order),
             )
     except (ValueError, OSError, ImportError, RuntimeError) as error:
-        return LogModes(path.name, mark, problem=" ".join(str(error).split()))
+        return LogModes(path.name, mark, start, problem=" ".join(str(error).split()))
     modes, count = fit.modes, len(fit.channels.names)
     return LogModes(
         path.name,

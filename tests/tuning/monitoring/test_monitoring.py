@@ -185,6 +185,51 @@ def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
         monitor(logs, tmp_path / "nowhere" / "modes.json")
 
 
+def order_of(starts: dict[str, str], folder, monkeypatch) -> list[str]:
+    """Names of logs in the order of a history: of logs that start so, "?" one that is not read."""
+    for name in starts:
+        (folder / name).write_text("")
+
+    def entry(path, _):
+        start = starts[path.name]
+        return LogModes(path.name, "", start.strip("?"), problem="unread" if "?" in start else "")
+
+    monkeypatch.setattr("tuning.monitoring.history.entry_of", entry)
+    return [one.file for one in analyse(folder, folder / "modes.json").entries]
+
+
+def test_logs_are_in_the_order_of_their_instants(tmp_path, monkeypatch):
+    """The clock goes back at 03:00+02:00, so that 02:10+01:00 comes after 02:40+02:00."""
+    day = "2026-10-25T"
+    starts = {"a.csv": f"{day}02:10:00+01:00", "b.csv": f"{day}02:40:00+02:00"}
+    starts |= {"c.csv": f"{day}00:20:00.500000+00:00"}
+    assert order_of(starts, tmp_path, monkeypatch) == ["c.csv", "b.csv", "a.csv"]
+
+
+def test_times_of_day_are_no_dates(tmp_path, monkeypatch):
+    """Names tell the day, of which a clock without a date says nothing."""
+    starts = {
+        "day 1.csv": "23:50:00.000",
+        "day 2.csv": "12:00:00.000",
+        "day 10.csv": "00:10:00.000",
+    }
+    assert order_of(starts, tmp_path, monkeypatch) == list(starts)
+
+
+def test_logs_that_are_not_read_keep_their_place(tmp_path, monkeypatch):
+    """They count neither before all others, where they would move the baseline, nor after."""
+    starts = {f"{i}.csv": f"2026-10-0{i}T00:00:00" for i in range(1, 10)} | {"4.csv": "?"}
+    assert order_of(starts, tmp_path, monkeypatch) == list(starts)
+
+
+def test_the_date_of_a_log_that_is_not_analysed_is_kept(tmp_path):
+    """Of three samples, which are too few for modes."""
+    rows = [f"2026-10-25 10:00:0{i},{i}.5" for i in range(3)]
+    (tmp_path / "short.csv").write_text("\n".join(["time,a [m/s^2]", *rows]))
+    (entry,) = analyse(tmp_path, tmp_path / "modes.json").entries
+    assert entry.problem and entry.start == "2026-10-25T10:00:00"
+
+
 @pytest.mark.parametrize("seed", [0])
 def test_command_finds_a_loss_of_rigidity(tmp_path, seed):
     """Sixty logs of two minutes, the last fifteen with three per cent less."""
