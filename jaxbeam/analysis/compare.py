@@ -6,6 +6,7 @@ stuck, late and coarse, or the beam is softer. Commands oscillate where they hav
 beyond those of the uncontrolled deflection.
 """
 
+import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -15,11 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound, no_bound
+from jaxbeam.analysis.bound.dampers import DamperPeak, damper_peak
 from jaxbeam.analysis.stability import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.control.feedforward import without_control
+from jaxbeam.control.semi_active import SemiActive
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Module
 from jaxbeam.runtime.printer import TableViews
@@ -135,6 +138,8 @@ class Comparison(TableViews, Module):
 
     `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.
     Both of the bound are None where limits of a voltage allow none (see `jaxbeam.bound`).
+    `damper_peaks` are the peaks that dampers of the semi-active controllers attain with rates known
+    in advance, where any are found.
     """
 
     case: Case
@@ -143,6 +148,7 @@ class Comparison(TableViews, Module):
     records: dict[str, Record]
     metrics: dict[str, PerformanceMetrics]
     bound: Bound | None
+    damper_peaks: dict[str, DamperPeak]
 
     @property
     def headline(self) -> str:
@@ -183,9 +189,19 @@ class Comparison(TableViews, Module):
             names = [name for name, found in obstacles.items() if found == obstacle]
             remarks.append(f"no margin of {', '.join(names)}: {obstacle}")
         for name, record in self.records.items():
-            verdicts = filter(None, (self.loop_summary(name), record.verdict))
+            verdicts = filter(
+                None, (self.damper_summary(name), self.loop_summary(name), record.verdict)
+            )
             remarks.append(f"{name}: {'; '.join(verdicts)}")
         return remarks
+
+    def damper_summary(self, name: str) -> str:
+        """Sentence on what the dampers of a semi-active controller attain; empty for others."""
+        if name not in self.damper_peaks:
+            return ""
+        best = self.damper_peaks[name]
+        share = (best.uncontrolled - self.metrics[name].peak) / (best.uncontrolled - best.peak)
+        return f"{best.verdict}; the law achieves {share:.1%} of this"
 
     def loop_summary(self, name: str) -> str:
         """Sentence on saturation, instability under stationary loads and oscillation of commands.
@@ -225,8 +241,9 @@ def compare(
 
     The bound is that of commands held over `period` (s), by default the shortest period of the
     controllers, or 0.01 s, starting at its multiples; it is left out where limits of a voltage
-    within an inner loop allow none. A controller of the case itself is left out
-    unless it is given too. Contact loss is in the verdicts of the records; there is no warning.
+    within an inner loop allow none. Dampers of a semi-active controller have the peak of
+    `analysis.bound.dampers.damper_peak`, too. A controller of the case itself is left out unless it
+    is given too. Contact loss is in the verdicts of the records; there is no warning.
 
     Raises ValueError without controllers, for a case that is invalid with one of them (which it
     names), and as `bound`.
@@ -249,7 +266,14 @@ def compare(
         name: performance_metrics(record, uncontrolled, least_peak)
         for name, record in records.items()
     }
-    return Comparison(uncontrolled_case, uncontrolled, optimal, records, metrics, least_peak)
+    damper_peaks = {}
+    for name, one in controllers.items():
+        if isinstance(one, SemiActive):
+            with contextlib.suppress(ValueError):  # no forces found
+                damper_peaks[name] = damper_peak(dataclasses.replace(case, controller=one))
+    return Comparison(
+        uncontrolled_case, uncontrolled, optimal, records, metrics, least_peak, damper_peaks
+    )
 
 
 class MetricsOverCases(NamedTuple):

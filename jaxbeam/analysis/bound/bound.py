@@ -22,7 +22,7 @@ absolute values selects smooth ones, and reduces the number of rounds.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -63,6 +63,7 @@ from jaxbeam.simulation.record import Record
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 MAX_BATCH_SIZE = 1024  # unit commands at once; fewer where memory is short
+NO_PLACES = np.zeros(0)
 COPIES = 3  # of the states of all steps of a run, while they are integrated
 
 
@@ -70,7 +71,8 @@ class InputInfluence(Module):
     """Modal coordinates at `times` (s): `unforced` by commands, and `response` to unit commands.
 
     A unit command is held from one of the `hold_times` (s) to the next. `deflection_rows` map the
-    coordinates to the deflection (m) at given positions. Relative errors are about 1e-9.
+    coordinates to the deflection (m) at given positions. `velocity` and `velocity_response` are
+    those (m/s) of the beam at some places as holds begin. Relative errors are about 1e-9.
     """
 
     deflection_rows: Float[np.ndarray, "position mode"]
@@ -78,6 +80,8 @@ class InputInfluence(Module):
     times: Float[np.ndarray, " time"]
     unforced: Float[np.ndarray, "time mode"]
     response: Float[np.ndarray, "time mode hold actuator"]
+    velocity: Float[np.ndarray, "hold place"]
+    velocity_response: Float[np.ndarray, "hold place hold actuator"]
 
     def deflection(
         self, commands: Float[np.ndarray, "hold actuator"]
@@ -113,12 +117,16 @@ class _UnitCommands(AbstractInputPolicy):
 
 
 def input_influence(
-    case: Case, positions: Float[np.ndarray, " position"], period: float, spacing: float
+    case: Case,
+    positions: Float[np.ndarray, " position"],
+    period: float,
+    spacing: float,
+    places: Float[np.ndarray, " place"] = NO_PLACES,
 ) -> InputInfluence:
     """Influence of commands held over a period (s) on a case, with rows for positions (m).
 
-    The controller of the case, if any, is left out. Times are at most `spacing` (s) apart; the
-    starts of all holds and the end of the run are among them.
+    Velocities are those at `places` (m). The controller of the case, if any, is left out. Times are
+    at most `spacing` (s) apart; the starts of all holds and the end of the run are among them.
 
     Raises ValueError if the response takes more than half of the memory that is free, RuntimeError
     if no time step meets TOLERANCE.
@@ -154,9 +162,9 @@ def input_influence(
         np.append(hold_index, np.full(padding, count)),
         np.append(actuator_index, np.zeros(padding, int)),
     )
-    coordinates = np.concatenate(
+    outputs = np.concatenate(
         [
-            _unit_responses(uncontrolled_case, shapes, schedule, substeps, *indices)
+            _unit_responses(uncontrolled_case, shapes, schedule, substeps, places, *indices)
             for indices in zip(
                 hold_index.reshape(-1, batch_size),
                 actuator_index.reshape(-1, batch_size),
@@ -165,15 +173,19 @@ def input_influence(
         ],
         axis=-1,
     )
-    response = coordinates[..., 2 : count * actuators + 2]
+    response = outputs[..., 2 : count * actuators + 2]
     if load_set(case).profile is not None:
-        response = response - coordinates[..., 1:2]
+        response = response - outputs[..., 1:2]
+    response = response.reshape(*response.shape[:2], count, actuators)
+    unforced, modes, holds = outputs[..., 0], case.beam.modes, np.searchsorted(times, hold_times)
     return InputInfluence(
         _deflection_rows(uncontrolled_case, shapes, positions),
         hold_times,
         times,
-        coordinates[..., 0],
-        response.reshape(*response.shape[:2], count, actuators),
+        unforced[:, :modes],
+        response[:, :modes],
+        unforced[holds, modes:],
+        response[holds, modes:],
     )
 
 
@@ -188,10 +200,14 @@ def _unit_responses(
     shapes: StaticShapes,
     schedule: EventSchedule,
     substeps: int,
+    places,
     hold_index,
     actuator_index,
 ):
-    """Modal coordinates (time, mode, batch): under weights for hold -1, else a unit command."""
+    """Modal coordinates, then velocities at places (time, ..., batch).
+
+    Under the weights for hold -1, else under a unit command.
+    """
     model, case_loads = modal_model(case, shapes.layout), load_set(case, shapes.layout)
     size = (case_loads.wheel_count, hold_index.shape[0])
     wheels = jax.tree.map(
@@ -223,7 +239,9 @@ def _unit_responses(
         discrete, loads, max_loads=shapes.max_loads, steps=steps, policy=policy
     )
     sample_steps = substeps * grid.event_panels[schedule.sample_events]
-    return states[sample_steps][:, : 2 * case.beam.modes : 2]
+    modal = states[sample_steps][:, : 2 * case.beam.modes]
+    velocities = xp.einsum("pm,tmb->tpb", model.shapes(places, (0,))[0], modal[:, 1::2])
+    return xp.concatenate([modal[:, ::2], velocities], axis=1)
 
 
 # Tolerances and the penalty are relative to the largest deflection without commands.
@@ -250,30 +268,31 @@ def least_peak(
     Raises ValueError if no commands meet the limits, RuntimeError if the solver fails.
     """
     program = _LinearProgram(influence, low, high, max_change)
-    commands, peak = np.zeros(influence.response.shape[2:]), FIRST_ROWS
-    for _ in range(MAX_ROUNDS):
-        if not program.add_violated_rows(commands, peak):
-            break
-        peak, commands, _ = program.solve(ACTIVITY_PENALTY)
-    else:
-        raise RuntimeError(
-            f"the linear program of the bound has not converged in {MAX_ROUNDS} rounds"
-        )
+    commands = program.attaining_commands()
     # With a part of the rows the optimum is at most the least peak: a bound in any case.
     peak, _, multipliers = program.solve(0.0)
-    # The solver meets limits to its tolerance; the commands meet them exactly.
-    changes = np.clip(np.diff(commands, axis=0, prepend=0.0), -max_change, max_change)
-    return (
-        peak * program.deflection_scale,
-        np.clip(np.cumsum(changes, axis=0), low, high),
-        multipliers,
-    )
+    return peak * program.deflection_scale, commands, multipliers
+
+
+def attaining_commands(
+    influence: InputInfluence,
+    low: Float[np.ndarray, " actuator"],
+    high: Float[np.ndarray, " actuator"],
+    max_change: Float[np.ndarray, " actuator"],
+    others: tuple[Any, Float[np.ndarray, " row"]],
+) -> Float[np.ndarray, "hold actuator"]:
+    """Commands whose peak is the least to 1e-5, under further constraints.
+
+    Limits are those of `least_peak`; `others` are a matrix (row, command) and a right side, matrix
+    @ commands <= right side, with the commands hold by hold. Raises as `least_peak`.
+    """
+    return _LinearProgram(influence, low, high, max_change, others).attaining_commands()
 
 
 class _LinearProgram:
     """Linear program in scaled unknowns, with the rows added so far."""
 
-    def __init__(self, influence, low, high, max_change):
+    def __init__(self, influence, low, high, max_change, others=None):
         self.influence = influence
         self.shape = influence.response.shape[2:]
         self.deflection_scale = np.max(np.abs(influence.unforced @ influence.deflection_rows.T))
@@ -281,8 +300,30 @@ class _LinearProgram:
         self.low, self.high, self.max_change = (
             part / self.command_scale for part in (low, high, max_change)
         )
+        matrix, self.others_right = (np.zeros((0, self.shape[0] * self.shape[1])), np.zeros(0))
+        if others is not None:
+            matrix, self.others_right = others
+        self.others = scipy.sparse.csr_array(matrix) * np.tile(self.command_scale, self.shape[0])
         # Rows so far: time index, position index, sign of the deflection.
         self.generated_rows = np.zeros((3, 0), int)
+
+    def attaining_commands(self) -> Float[np.ndarray, "hold actuator"]:
+        """Commands that attain the least peak to 1e-5. Raises as `least_peak`."""
+        commands, peak = np.zeros(self.shape), FIRST_ROWS
+        for _ in range(MAX_ROUNDS):
+            if not self.add_violated_rows(commands, peak):
+                break
+            peak, commands, _ = self.solve(ACTIVITY_PENALTY)
+        else:
+            raise RuntimeError(
+                f"the linear program of the bound has not converged in {MAX_ROUNDS} rounds"
+            )
+        # The solver meets limits to its tolerance; the commands meet them exactly.
+        low, high, most = (
+            part * self.command_scale for part in (self.low, self.high, self.max_change)
+        )
+        changes = np.clip(np.diff(commands, axis=0, prepend=0.0), -most, most)
+        return np.clip(np.cumsum(changes, axis=0), low, high)
 
     def add_violated_rows(self, commands, peak) -> bool:
         """Add rows at local maxima along the beam where the deflection exceeds a peak.
@@ -361,10 +402,12 @@ class _LinearProgram:
             [-difference, -change, None, None],
             [identity, None, -identity, None],
             [-identity, None, -identity, None],
+            [self.others, None, None, np.zeros((self.others_right.size, 1))],
             [peak_rows, None, None, -np.ones((sign.size, 1))],
         ]
         matrix = sp.block_array(blocks).tocsr()
-        return matrix, np.concatenate([np.zeros(matrix.shape[0] - sign.size), -unforced])
+        zeros = np.zeros(matrix.shape[0] - sign.size - self.others_right.size)
+        return matrix, np.concatenate([zeros, self.others_right, -unforced])
 
     def _bounds(self):
         holds, actuators = self.shape
@@ -537,11 +580,15 @@ def no_bound(case: Case) -> str:
 
 
 def checked_influence(
-    case: Case, positions: ArrayLike | None, period: float | None, spacing: float | None
+    case: Case,
+    positions: ArrayLike | None,
+    period: float | None,
+    spacing: float | None,
+    places: Float[np.ndarray, " place"] = NO_PLACES,
 ) -> tuple[InputInfluence, Float[np.ndarray, " position"], float, float]:
     """Influence of held commands, positions (m), period and spacing (s), with the defaults filled.
 
-    Raises ValueError as `bound`.
+    Velocities are those at `places` (m). Raises ValueError as `bound`.
     """
     if obstacle := no_bound(case):
         raise ValueError(f"{obstacle}: leave them out")
@@ -566,7 +613,7 @@ def checked_influence(
         raise ValueError(f"period {period:g} s is longer than the run, {case.run.duration:g} s")
     if not case.loads:
         raise ValueError("a bound needs loads, and the case has none; add one")
-    influence = input_influence(case, positions, period, spacing)
+    influence = input_influence(case, positions, period, spacing, places)
     if not np.any(influence.unforced @ influence.deflection_rows.T):
         raise ValueError("no load deflects the beam at these positions during the run")
     if not np.any(influence.response):

@@ -209,6 +209,7 @@ def _to_dict(comparison: "Comparison") -> dict:
         "controllers": {
             name: _metrics_to_dict(metrics)
             | {
+                "damper_peak": best.peak if (best := comparison.damper_peaks.get(name)) else None,
                 "loop": comparison.loop_summary(name),
                 "verdict": comparison.records[name].verdict,
             }
