@@ -274,6 +274,7 @@ COMPARISON = {
             "reserve": MARGIN,
             "limit_cycles": LIMIT_CYCLES,
             "swings": LIMIT_CYCLES,
+            "damper_peak": None,
             "loop": None,
             "verdict": None,
         }

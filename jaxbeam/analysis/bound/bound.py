@@ -284,7 +284,9 @@ def attaining_commands(
     """Commands whose peak is the least to 1e-5, under further constraints.
 
     Limits are those of `least_peak`; `others` are a matrix (row, command) and a right side, matrix
-    @ commands <= right side, with the commands hold by hold. Raises as `least_peak`.
+    @ commands <= right side, with the commands hold by hold.
+
+    Raises ValueError if no commands meet the constraints, RuntimeError if the solver fails.
     """
     return _LinearProgram(influence, low, high, max_change, others).attaining_commands()
 
@@ -308,7 +310,10 @@ class _LinearProgram:
         self.generated_rows = np.zeros((3, 0), int)
 
     def attaining_commands(self) -> Float[np.ndarray, "hold actuator"]:
-        """Commands that attain the least peak to 1e-5. Raises as `least_peak`."""
+        """Commands that attain the least peak to 1e-5.
+
+        Raises RuntimeError if rows are added without end, and as `solve`.
+        """
         commands, peak = np.zeros(self.shape), FIRST_ROWS
         for _ in range(MAX_ROUNDS):
             if not self.add_violated_rows(commands, peak):
