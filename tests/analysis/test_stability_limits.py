@@ -266,6 +266,26 @@ def test_oscillations_are_counted_beyond_those_of_the_deflection():
     assert forced.extra == 0 and not forced.oscillates
 
 
+def test_a_command_is_compared_with_its_own_or_the_last_sensor():
+    """Of three commands, all with the reversals of the second of two sensors."""
+    case = jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, 0.03, modes=2),
+        actuators=[jb.PointForce(x) for x in (0.1, 0.2, 0.3)],
+        sensors=[jb.Sensor(0.2), jb.Sensor(0.3)],
+        loads=[jb.MovingForce(force=1.0, speed=0.4)],
+        controller=jb.OutputFeedback(np.zeros((3, 2))),
+        run=jb.Run(2.0),
+    )
+    record = jb.simulate(case)
+    slow, fast = (np.sin(2 * np.pi * f * TIMES) for f in (1.0, 9.0))
+    shapes = np.asarray(record.modes.shapes(np.array([0.2, 0.3])))
+    coordinates = np.linalg.solve(shapes, np.stack([slow, fast])).T
+    uncontrolled = dataclasses.replace(record, coordinates=coordinates)
+    controlled = dataclasses.replace(record, command=np.stack([fast] * 3, axis=1))
+    found = command_oscillations(controlled, uncontrolled)
+    assert [one.extra for one in found] == [2 * 2 * (9 - 1), 0, 0]
+
+
 def unstable_case(gain: float, delay: float | None, damping: float) -> jb.Case:
     """Two spans under the cubic law, through filters of 20 Hz, as in section 6.2."""
     case = load("C")
