@@ -32,7 +32,6 @@ import difflib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,7 @@ from jaxbeam.files.case_file import find_vehicle_files
 from tuning.logs.log import Log, LogWarning, check_samples, doubts, with_named_columns, with_times
 from tuning.logs.quality import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
-from tuning.logs.readers.table import shown
+from tuning.logs.readers.table import EPOCH, LATEST, date_of, shown
 from tuning.logs.units import UNITS, UNITS_OF_CONDITIONS, is_unit, transducer_unit, unit
 
 _KEYS = {"loads": TABLES, "columns": TABLE, "time": WORD, "runs": TABLE}
@@ -162,8 +161,7 @@ def _loads(prefix: str, table: dict[str, Any]) -> tuple[AbstractLoad, ...]:
     return read_parts(f"{prefix}loads", table.get("loads", []), AbstractLoad)
 
 
-EPOCH, LATEST = 3e8, 1e10  # s since 1970: times between these are dates, from 1979 on
-EPOCH_START, WORKBOOK_DAYS = datetime(1970, 1, 1, tzinfo=UTC), 25569  # days from 1899-12-30 to it
+WORKBOOK_DAYS = 25569  # days from 1899-12-30 to 1970
 EPOCHS = {"ns": 3e17, "us": 3e14, "ms": 3e11, "s": EPOCH}  # least such time, by its unit
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
 
@@ -325,8 +323,7 @@ def _make_log(
         len(values) and EPOCH < factor * values[0, 0] < LATEST
     ):  # a date, by the seconds since 1970, or days of workbooks
         origin = WORKBOOK_DAYS * 86400.0 if column_units[0][0] == "d" else 0.0
-        moment = EPOCH_START + timedelta(seconds=float(factor * values[0, 0]) - origin)
-        began = began or moment.isoformat(timespec="milliseconds")
+        began = began or date_of(float(factor * values[0, 0]) - origin)
         values[:, 0] -= values[0, 0]
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked for below
         values = values * np.array([unit.factor for _, unit in column_units])

@@ -68,6 +68,7 @@ def test_channels_that_start_at_different_times_are_aligned(tmp_path, key, offse
     tdms(path, {"a": (signal(TIMES), clock()), "b": (signal(TIMES + offset), later)})
     log = read_warned(path, r"different times \(a 0 to 1.995 s, b 0.5.* to .* aligned")
     assert log.times[0] == pytest.approx(np.ceil(offset / STEP) * STEP)
+    assert log.start.startswith(f"2024-03-31T00:59:50.{1000 * log.times[0]:.0f}")
     assert log.times[-1] == pytest.approx(1.995)
     np.testing.assert_allclose(1e3 * log.values[:, 0], signal(log.times), atol=1e-12)
     np.testing.assert_allclose(1e3 * log.values[:, 1], signal(log.times), atol=atol)
@@ -366,6 +367,7 @@ def test_starts_of_datasets_may_be_dates(tmp_path):
         file["a [mm]"].attrs["start_time"] = "2024-03-31T02:59:59.500+02:00"
         file["b [mm]"].attrs["start_time"] = "2024-03-31T01:00:00Z"
     log = read_warned(tmp_path / "run.h5", "aligned by them, and read from 0.5 to 1.995 s")
+    assert log.start == "2024-03-31T01:00:00.000+00:00"
     np.testing.assert_allclose(1e3 * log.values, signal(log.times)[:, None] * [1, -1], atol=1e-5)
 
 

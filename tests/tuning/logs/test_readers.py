@@ -507,6 +507,7 @@ def test_layouts(tmp_path, clocks, separator, decimal, name):
     log = read_log(write(tmp_path, lvm(clocks, separator, decimal), name))
     step = 0.001 if clocks == "No" else 0.0012  # the printed Delta_X is used only without times
     assert (log.names, log.units) == (("a", "b"), ("g", "mm"))
+    assert log.start == "2024-03-01T23:59:59.500000"
     np.testing.assert_allclose(log.times, [0, step, 2 * step], rtol=1e-14)
     np.testing.assert_allclose(log.values[:, 0] / 9.80665, [1.5, 2.5, 3.5], rtol=1e-14)
     np.testing.assert_allclose(log.values[:, 1], [2e-3, 3e-3, 4e-3], rtol=1e-14)

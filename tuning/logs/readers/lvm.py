@@ -6,7 +6,7 @@ often rounded, so it is used only where a file has no times.
 """
 
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -54,9 +54,10 @@ def read_lvm(path: Path) -> dict[str, LogTable]:
             )
     values = _join_segments(path, segments, [part[2] for part in parts])
     numbered = np.concatenate([segment.lines for segment in segments])
-    broken = _breaks_off(segments[-1])
+    broken, began = _breaks_off(segments[-1]), _start(segments[0])
+    start = "" if began is None else (began[0] + timedelta(seconds=began[1])).isoformat()
     table = LogTable(
-        ("time", *names), ("s", *units), values, numbered, time="time", warnings=broken
+        ("time", *names), ("s", *units), values, numbered, "time", warnings=broken, start=start
     )
     return {"": table}
 
@@ -209,18 +210,27 @@ def _seconds_between(path, first: _Segment, later: _Segment) -> float:
     """Time (s) from the start of one segment to that of another, by their Date and Time."""
     starts = []
     for segment in (first, later):
-        date, time = (segment.header.get(key, [""])[0] for key in ("Date", "Time"))
-        whole, _, fraction = time.replace(",", ".").partition(".")
-        try:
-            start = datetime.strptime(f"{date} {whole}", "%Y/%m/%d %H:%M:%S")
-            starts.append((start, float(f"0.{fraction or 0}")))
-        except ValueError:
+        start = _start(segment)
+        if start is None:
+            date, time = (segment.header.get(key, [""])[0] for key in ("Date", "Time"))
             raise ValueError(
                 f"{path}, line {segment.lines[0]}: the times of segments start again, but this "
                 f"segment's Date {date!r} and Time {time!r} do not tell when it started"
-            ) from None
+            )
+        starts.append(start)
     (day, part), (later_day, later_part) = starts
     return (later_day - day).total_seconds() + later_part - part
+
+
+def _start(segment: _Segment) -> tuple[datetime, float] | None:
+    """Date and time of the start of a segment in whole seconds, and the rest (s); None without."""
+    date, time = (segment.header.get(key, [""])[0] for key in ("Date", "Time"))
+    whole, _, fraction = time.replace(",", ".").partition(".")
+    try:
+        start = datetime.strptime(f"{date} {whole}", "%Y/%m/%d %H:%M:%S")
+        return start, float(f"0.{fraction or 0}")
+    except ValueError:
+        return None
 
 
 FORMAT = LogFormat(

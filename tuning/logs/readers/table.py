@@ -4,6 +4,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,18 +92,20 @@ def table_of(
     units: Mapping[str, str | None],
     clocks: Mapping[str, Clock] | None = None,
     warnings: Sequence[str] = (),
+    origin: float = 0.0,
 ) -> LogTable:
     """Table of the arrays of one run, by name; a name may be a heading with a unit.
 
     An array of several columns becomes `name.0`, `name.1`, ... Arrays with `clocks` are joined by
-    them, where no column has times. Other arrays that are not as long as the times (or else as most
-    of the arrays) are left out, with a warning if they may be channels.
+    them, where no column has times; the table has a date of its start if they are in s since 1970,
+    or from an `origin` that is. Other arrays that are not as long as the times (or else as most of
+    the arrays) are left out, with a warning if they may be channels.
 
     Raises ValueError if there are no numbers.
     """
     arrays = {name: np.asarray(array, float) for name, array in arrays.items()}
     has_times = any(is_time_name(parse_heading(label)[0]) for label in arrays)
-    times, said = None, list(warnings)
+    times, said, start = None, list(warnings), ""
     if clocks and not has_times:
         timed = {label: upright(arrays[label]) for label in arrays if label in clocks}
         timed = {label: array for label, array in timed.items() if len(array) > 1}
@@ -110,6 +113,7 @@ def table_of(
             own = {label: clocks[label] for label in timed}
             times, joined, moved = join_channels(source, timed, own)
             arrays, said = arrays | joined, [*said, *moved]
+            start = date_of(origin + min(one.start for one in own.values()) + float(times[0]))
     length = _length(arrays) if times is None else times.size
     if length < 2:
         raise ValueError(f"{source}: there is no list of numbers in it")
@@ -135,8 +139,25 @@ def table_of(
         values = np.column_stack([times, values])
     notes = () if lost else tuple(others)
     return LogTable(
-        tuple(names), tuple(found), values, time=time, notes=notes, warnings=tuple(said)
+        tuple(names),
+        tuple(found),
+        values,
+        time=time,
+        notes=notes,
+        warnings=tuple(said),
+        start=start,
     )
+
+
+EPOCH, LATEST = 3e8, 1e10  # s since 1970: times between these are dates, from 1979 on
+EPOCH_START = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def date_of(seconds: float) -> str:
+    """Date and time (ISO 8601) of seconds since 1970, "" for those that are no date."""
+    if not EPOCH < seconds < LATEST:
+        return ""
+    return (EPOCH_START + timedelta(seconds=seconds)).isoformat(timespec="milliseconds")
 
 
 def upright(array: np.ndarray) -> np.ndarray:

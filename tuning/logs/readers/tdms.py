@@ -47,8 +47,8 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
         if numeric:
             source = f"{path}, group {name!r}"
             units = {a: text_attribute(channels[a].properties.get("unit_string")) for a in numeric}
-            clocks = _clocks({a: channels[a] for a in numeric})
-            runs[name] = table_of(source, numeric, units, clocks, broken)
+            clocks, origin = _clocks({a: channels[a] for a in numeric})
+            runs[name] = table_of(source, numeric, units, clocks, broken, origin)
     return runs
 
 
@@ -74,9 +74,12 @@ def _is_truncated(file) -> bool:
     return bool(file.file_status.incomplete_final_segment)
 
 
-def _clocks(channels) -> dict[str, Clock] | None:
-    """Clocks of channels by their waveform properties; None if no channel has them."""
-    starts, steps, dates = {}, {}, {}
+def _clocks(channels) -> tuple[dict[str, Clock] | None, float]:
+    """Clocks of channels by their waveform properties, None if no channel has them.
+
+    And the date of their zero, in s since 1970; 0 without one.
+    """
+    starts, steps, dates, origin = {}, {}, {}, 0.0
     for name, channel in channels.items():
         properties = channel.properties
         starts[name] = float(properties.get("wf_start_offset", 0.0))
@@ -85,12 +88,14 @@ def _clocks(channels) -> dict[str, Clock] | None:
             if isinstance(properties.get("wf_start_time"), np.datetime64):
                 dates[name] = properties["wf_start_time"]
     if not steps:
-        return None
+        return None, origin
     if len(dates) == len(steps):  # of some only, it tells nothing of the others
         first = min(dates.values())
+        origin = float((first - np.datetime64(0, "s")) / np.timedelta64(1, "s"))
         for name, date in dates.items():
             starts[name] += (date - first) / np.timedelta64(1, "s")
-    return clocks_of([name for name in channels if not is_time_name(name)], starts, steps)
+    names = [name for name in channels if not is_time_name(name)]
+    return clocks_of(names, starts, steps), origin
 
 
 FORMAT = LogFormat("LabVIEW (TDMS)", read_tdms, suffixes=(".tdms",), magics=(MAGIC,))
