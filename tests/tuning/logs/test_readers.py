@@ -8,6 +8,7 @@ import re
 import warnings
 import wave
 import zipfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ def tdms(path, runs=("",), step=0.002, extra=None):
 def mdf(path, groups=None):
     asammdf = pytest.importorskip("asammdf")
     file = asammdf.MDF(version="4.10")
+    file.start_time = datetime(2026, 3, 29, 23, 59, 58, tzinfo=UTC)
     for times, channels in groups or [(TIMES, {"d1": D1, "d2": D2})]:
         signals = [asammdf.Signal(v, times, name=n, unit="mm") for n, v in channels.items()]
         file.append(signals)
@@ -93,6 +95,7 @@ def test_groups_of_a_measurement_file_are_joined_by_their_times(tmp_path):
     np.testing.assert_allclose(log.times, times, atol=1e-12)
     np.testing.assert_allclose(log.values[:, 0], 1e-3 * np.sin(20 * times), rtol=1e-12)
     np.testing.assert_allclose(log.values[:, 1], 1e-3 * np.sin(5 * times), atol=1e-7)
+    assert log.start == "2026-03-29T23:59:58.002+00:00"  # of the first time in common
     uneven = np.append(TIMES[:-1], 1.0)
     mdf(tmp_path / "uneven.mf4", [(uneven, {"d1": D1}), (slow, {"d2": slow})])
     with pytest.raises(ValueError, match=r"uneven.mf4: the times of d1 are uneven, and other"):
@@ -117,6 +120,7 @@ def test_a_channel_of_times_and_invalid_samples_of_a_measurement_file(tmp_path):
 
 def test_a_measurement_file_that_is_cut_off(tmp_path, capfd):
     mdf(tmp_path / "run.mf4")
+    assert read_log(tmp_path / "run.mf4").start == "2026-03-29T23:59:58.000+00:00"
     content = (tmp_path / "run.mf4").read_bytes()
     for size in (100, len(content) // 2, len(content) - 20):
         (tmp_path / "cut.mf4").write_bytes(content[:size])

@@ -1,6 +1,7 @@
 """ASAM measurement data (.mf4, .mdf), by asammdf: groups of channels, each with its own times."""
 
 import contextlib
+import dataclasses
 import gc
 import io
 import logging
@@ -15,6 +16,7 @@ from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
     damaged_file_error,
+    date_of,
     is_time_name,
     parse_heading,
     read_bytes,
@@ -39,7 +41,7 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
     content = io.BytesIO(read_bytes(path))
     try:
         with _silenced():
-            groups = _groups(asammdf, content)
+            groups, origin = _groups(asammdf, content)
     except Exception as error:  # asammdf raises many types for damaged files
         raise damaged_file_error(path, error) from None
     arrays, units, clocks = {}, {}, {}
@@ -51,10 +53,13 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
             arrays[name], units[name] = _samples(signal, times), signal.unit or None
             clocks[name] = times
     first = next(iter(clocks.values()), np.zeros(0))
+    if not clocks:
+        return {}
     if all(np.array_equal(times, first) for times in clocks.values()):
-        arrays = {"time": first, **arrays}
-        return {"": table_of(str(path), arrays, units | {"time": "s"})} if clocks else {}
-    return {"": table_of(str(path), arrays, units, {n: _clock(path, n, clocks[n]) for n in clocks})}
+        table = table_of(str(path), {"time": first, **arrays}, units | {"time": "s"})
+        return {"": dataclasses.replace(table, start=date_of(origin + float(first[0])))}
+    own = {name: _clock(path, name, times) for name, times in clocks.items()}
+    return {"": table_of(str(path), arrays, units, own, origin=origin)}
 
 
 @contextlib.contextmanager
@@ -80,8 +85,8 @@ def _samples(signal, times: np.ndarray) -> np.ndarray:
     return found
 
 
-def _groups(asammdf, content) -> dict[int, tuple[np.ndarray, list]]:
-    """Times (s) and signals of numbers of each group that has any."""
+def _groups(asammdf, content) -> tuple[dict[int, tuple[np.ndarray, list]], float]:
+    """Times (s) and signals of numbers of each group that has any, and their zero, s since 1970."""
     problem = None
     try:
         with asammdf.MDF(content) as file:
@@ -92,7 +97,7 @@ def _groups(asammdf, content) -> dict[int, tuple[np.ndarray, list]]:
                 signals = [file.get(group=number, index=i) for i in index]
                 signals = [s for s in signals if s.samples.dtype.kind in "iuf" and s.samples.size]
                 found |= {number: (file.get_master(number), signals)} if signals else {}
-            return found
+            return found, file.start_time.timestamp()
     except Exception as error:
         problem = str(error).replace(f"'{content}'", "it") or type(error).__name__
     gc.collect()  # of the broken file, while what it prints is suppressed
