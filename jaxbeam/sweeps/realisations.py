@@ -62,8 +62,9 @@ def realisation_statistics(
     """Mean, fractile, their intervals, and number of realisations still needed, of each run.
 
     "needed" realisations close the interval of the fractile and shrink half of it to the fraction
-    `precision` of the fractile, as intervals shrink with the root of their number. Open ends are
-    infinite. Failed runs, NaN, are left out.
+    `precision` of the fractile, as intervals shrink with the root of their number; of a fractile of
+    0 no number does, unless the bounds are 0. Open ends are infinite. Failed runs, NaN, are left
+    out.
 
     >>> import numpy as np
     >>> from jaxbeam.sweeps.realisations import realisation_statistics
@@ -91,9 +92,10 @@ def realisation_statistics(
             own[high - 1] if high <= own.size else np.inf,
         )
         least = least_count(level, confidence) if 0 < level < 1 else own.size
-        if np.isfinite(bounds).all():
-            width = (bounds[1] - bounds[0]) / 2
-            least = max(least, math.ceil(own.size * (width / (precision * abs(fractile))) ** 2))
+        half_width = (bounds[1] - bounds[0]) / 2
+        if 0 < half_width < np.inf:
+            ratio = half_width / (precision * abs(fractile)) if fractile else np.inf
+            least = max(least, np.ceil(own.size * ratio**2))
         row = mean, mean - half, mean + half, fractile, *bounds, max(0, least - own.size)
         for name, value in zip(names, row, strict=False):
             found[name][i] = value

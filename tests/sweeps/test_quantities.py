@@ -176,3 +176,15 @@ def test_free_outputs_are_bounded_by_the_energies_of_the_blocks(coupled):
     assert_allclose(found.sum(axis=0), whole, rtol=1e-12)
     share = np.abs(C @ states) / (bounds @ np.sqrt(found))
     assert np.all(share <= 1) and np.all(share.max(axis=1) > 0.45)
+
+
+def test_supports_have_no_truncation_error():
+    """Of the midspan: 1 - 96 / pi^4 (1 + 1 / 81) for three modes; sums at supports are zero."""
+    case = jb.Case(
+        jb.Beam(20.0, 6e9, 9e3, modes=3),
+        sensors=[jb.Sensor(0.0), jb.Sensor(10.0), jb.Sensor(20.0)],
+        loads=[jb.MovingForce(force=1e5, speed=20.0)],
+    )
+    found = jb.sweep(case, {"loads.0.speed": [10.0, 20.0]}, progress=False)["peak_deflection"]
+    expected = 1 - 96 / np.pi**4 * (1 + 1 / 81)
+    assert found.attrs["truncation_error"] == pytest.approx(expected, rel=1e-9)

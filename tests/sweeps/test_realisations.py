@@ -67,6 +67,18 @@ def test_mean_fractile_and_need():
     assert np.isnan(realisation_statistics(np.full(3, np.nan), 0.5)["mean"])
 
 
+@pytest.mark.parametrize(("largest", "needed"), [(0.0, 0.0), (1.0, np.inf)])
+def test_fractiles_of_zero(largest, needed):
+    """As of the deflection of a support, or a limit that is passed in few runs.
+
+    Of 100 values the bounds of the fractile are the 90th and the 100th.
+    """
+    values = np.append(np.zeros(99), largest)
+    found = realisation_statistics(values, 0.95)
+    assert (found["fractile"], found["low"], found["high"]) == (0.0, 0.0, largest)
+    assert found["needed"] == needed
+
+
 ROUGH = jb.Case(
     jb.Beam(20.0, 4e9, 8e3, damping_ratio=0.02, modes=3),
     sensors=[jb.Sensor(10.0), jb.Sensor(7.0, quantity="moment")],
