@@ -80,6 +80,7 @@ def absorber_peaks(case: Case, heights: Float[Array, " output"]) -> dict[str, Ar
 
 
 LEFT_OUT = 3  # highest modes whose dynamic part estimates that of all modes beyond
+ROUNDING = 1e-12  # of the motion along the beam, below which that of a point is zero
 MAX_SAMPLES = 400  # of a run from which the errors are estimated
 
 
@@ -173,10 +174,17 @@ def peak_errors(
 def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, " sensor"]:
     """Estimated truncation error of the quantity of each sensor, relative to its largest value.
 
-    See `truncation_changes`.
+    See `truncation_changes`. Zero where the motion is nothing but rounding, as at supports.
     """
-    values = (sensor_history(case, modes, motion, sensor) for sensor in case.sensors)
-    largest = xp.array([xp.max(xp.abs(one)) for one in values]).reshape(-1)
+    shapes, sizes = modes.shapes(trial_positions(case)), []
+    for sensor in case.sensors:
+        quantity = QUANTITIES[sensor.quantity]
+        size = xp.max(xp.abs(sensor_history(case, modes, motion, sensor)))
+        if quantity.x_derivative == 0 and not quantity.of_twist:
+            along = xp.max(xp.abs(motion[quantity.time_derivative] @ shapes.T))
+            size = xp.where(size > ROUNDING * along, size, 0.0)
+        sizes.append(size)
+    largest = xp.array(sizes).reshape(-1)
     return _ratio(truncation_changes(case, modes, motion), largest)
 
 

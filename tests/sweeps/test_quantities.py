@@ -188,3 +188,9 @@ def test_supports_have_no_truncation_error():
     found = jb.sweep(case, {"loads.0.speed": [10.0, 20.0]}, progress=False)["peak_deflection"]
     expected = 1 - 96 / np.pi**4 * (1 + 1 / 81)
     assert found.attrs["truncation_error"] == pytest.approx(expected, rel=1e-9)
+    case = dataclasses.replace(case, run=jb.Run(1.0, sample_rate=100.0))
+    record = jb.simulate(case)
+    errors, static = record.truncation_errors, 1e5 * 20.0**3 / (48 * 6e9)
+    assert errors[0] == errors[2] == 0.0
+    missed = errors[1] * np.max(np.abs(record.sensor_values[:, 1]))
+    assert missed == pytest.approx(expected * static, rel=1e-3)
