@@ -302,6 +302,15 @@ def _is_left_out(case: Case, address: str) -> bool:
     return part is not None and getattr(part, name, part) is None
 
 
+def check_is_case(case: Any) -> None:
+    """Check that what a function is given is a case. Raises TypeError for anything else."""
+    if not isinstance(case, Case):
+        raise TypeError(
+            f"a jaxbeam.Case is needed, not a {type(case).__name__}; make one of parts by"
+            " jaxbeam.Case(beam, ...), of a file by jaxbeam.load_case(path)"
+        )
+
+
 def list_sizes(case: Case) -> dict[str, int]:
     """Numbers of parts at the keys of a case that hold lists of parts."""
     return {key: len(getattr(case, key)) for key, found in part_classes().items() if found.listed}

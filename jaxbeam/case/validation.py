@@ -16,7 +16,7 @@ from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support, has
-from jaxbeam.case.case import Case, list_sizes, parts
+from jaxbeam.case.case import Case, check_is_case, list_sizes, parts
 from jaxbeam.case.contact import ONE_RUN, AbstractContact
 from jaxbeam.case.fields import (
     ON_BEAM,
@@ -79,6 +79,7 @@ def check_plant(case: Case) -> None:
 
     Raises ValueError as `check_case`.
     """
+    check_is_case(case)
     for key, count in list_sizes(case).items():
         check_length(key, count)
     for address, part, part_class in parts(case):

@@ -16,7 +16,14 @@ from typing import Any
 
 import tomli_w
 
-from jaxbeam.case.case import Case, each_address, list_sizes, part_classes, unknown_address_error
+from jaxbeam.case.case import (
+    Case,
+    check_is_case,
+    each_address,
+    list_sizes,
+    part_classes,
+    unknown_address_error,
+)
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, describe_value, kind_of, kinds, refuses_traced, suggestion
 from jaxbeam.case.former_words import attribute_address
@@ -316,6 +323,7 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
     So is what a word implies, as the numbers of a vehicle of the library, unless the `whole` case
     is asked for. Raises ValueError if a part has no kind, though its table needs one.
     """
+    check_is_case(case)
     content: dict[str, Any] = {"title": case.title} if case.title else {}
     for key, (part_class, listed) in part_classes().items():
         value = getattr(case, key)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.beam import END_CONDITIONS
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.fields import check_on_beam, concrete, suggestion
 from jaxbeam.case.sensors import QUANTITIES, SIDES, SLOPE, quantity_of
 from jaxbeam.model.deflection_lines import (
@@ -79,6 +79,7 @@ def influence_line(
     >>> print(jb.influence_line(beam, x=1.0, load_positions=[0.5, 1.0], quantity="moment"))
     [0.25 0.5 ]
     """
+    check_is_case(case)
     if load_positions is None:
         load_positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)

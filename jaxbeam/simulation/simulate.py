@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.case import Case, check_is_case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import all_concrete, concrete, is_concrete
@@ -117,6 +117,7 @@ def simulate(
     >>> print(f"{1e3 * record.peak_deflection[0]:.2f} mm")
     2.00 mm
     """
+    check_is_case(case)
     if times is not None:
         check_times(times)
     sampling = case.run.duration, case.run.sample_rate

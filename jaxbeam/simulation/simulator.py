@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxbeam.case.case import Case, replace
+from jaxbeam.case.case import Case, check_is_case, replace
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.runtime.arrays import Module, any_traced, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
@@ -65,6 +65,7 @@ class Simulator(Module):
                 " is given: make it outside of jax.jit, vmap and grad, and call it with the traced"
                 " values"
             )
+        check_is_case(case)
         times = None if times is None else np.asarray(times, float)
         ranges = declared_ranges(case, vary)
         timing = [a for a in ranges if times is None and a in ("run.duration", "run.sample_rate")]

@@ -32,7 +32,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxbeam.case.actuators.electrodynamic import limited_loops
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import check_on_beam, refuses_traced
 from jaxbeam.case.validation import check_case
@@ -595,6 +595,7 @@ def checked_influence(
 
     Velocities are those at `places` (m). Raises ValueError as `bound`.
     """
+    check_is_case(case)
     if obstacle := no_bound(case):
         raise ValueError(f"{obstacle}: leave them out")
     check_case(case)
