@@ -97,10 +97,19 @@ class Prior:
 
 
 def as_prior(bounds: Any) -> Prior:
-    """A `Prior` as it is, or one with the bounds (low, high) or, for None, without any."""
+    """A `Prior` as it is, or one with the bounds (low, high) or, for None, without any.
+
+    Raises ValueError for bounds that are not two numbers.
+    """
     if isinstance(bounds, Prior):
         return bounds
-    return Prior() if bounds is None else Prior(*(float(bound) for bound in bounds))
+    if bounds is None:
+        return Prior()
+    try:
+        low, high = map(float, bounds)
+    except (TypeError, ValueError):
+        raise ValueError(f"bounds are two numbers, (low, high), not {bounds!r}") from None
+    return Prior(low, high)
 
 
 # Numbers that decide when samples are taken, or when commands begin or bend.

@@ -24,7 +24,9 @@ from jaxbeam.case.fields import (
     choice,
     concrete,
     count,
+    describe_value,
     is_concrete,
+    is_real,
     number,
 )
 from jaxbeam.case.former_words import attribute_address, present_address
@@ -402,6 +404,8 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     for address, value in each:
         if isinstance(value, str | list | tuple):
             value = in_si(value, unit_at(case, address), address)
+        if not is_real(value):
+            raise ValueError(f"{address} takes real numbers, not {describe_value(value)}")
         value = xp.asarray(value, float)
         parent, entry = _parent_and_entry(address, index)
         if address in index:

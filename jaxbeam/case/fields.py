@@ -41,11 +41,19 @@ def _as_array(unit: str, meaning: str):
     def convert(value):
         if isinstance(value, str | list | tuple) and _has_text(value):
             value = in_si(value, unit, meaning)
-        if isinstance(value, int | float | np.ndarray | np.generic | list | tuple):
-            return xp.asarray(value, float)
-        return value
+        listed = isinstance(value, int | float | np.ndarray | np.generic | list | tuple)
+        return xp.asarray(value, float) if listed and is_real(value) else value
 
     return convert
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value, or each entry of a list, can be real: no text, complex number or object."""
+    if isinstance(value, list | tuple):
+        return all(map(is_real, value))
+    if hasattr(value, "dtype"):
+        return value.dtype != jax.dtypes.float0 and np.dtype(value.dtype).kind in "biuf"
+    return isinstance(value, int | float)
 
 
 def _has_text(value) -> bool:
@@ -205,8 +213,10 @@ def concrete(
     """A value as an array of floats, also while it is differentiated (`grad`, `jvp`).
 
     Raises TracedNumberError if it is traced by `jit` or `vmap`; the error names `what` it is, and
-    `why` it must be concrete.
+    `why` it must be concrete. Raises ValueError for complex numbers, texts and other objects.
     """
+    if not is_real(value):
+        raise ValueError(f"{what} must be a real number, not {describe_value(value)}")
     if isinstance(value, jax.core.Tracer):
         try:
             value = jax.extend.core.concrete_or_error(None, value)
@@ -440,7 +450,8 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
         if field.default is not None:
             raise missing_error(address, field)
         return
-    if not isinstance(value, jax.Array | np.ndarray | np.generic | float | int):
+    numbers = isinstance(value, jax.Array | np.ndarray | np.generic | float | int)
+    if not numbers or not is_real(value):
         raise ValueError(f"{address} must be {describe_shape(field)}, not {describe_value(value)}")
     if not fits_shape(field, np.shape(value)):
         shape = np.shape(value)
@@ -508,4 +519,6 @@ def describe_value(value: Any) -> str:
     """A wrong value as error messages quote it."""
     if isinstance(value, str | bool | int | float | list | dict):
         return SHORT_REPR.repr(value)
+    if hasattr(value, "dtype"):
+        return f"an array of {value.dtype}"
     return f"a {type(value).__name__}"

@@ -284,7 +284,7 @@ class FrequencyResponse(TableViews, Module):
 
     def __repr__(self) -> str:
         pairs = "".join(f"\n  {p}" + f", in {p.unit}" * (p.unit != "1") for p in self.pairs)
-        if not is_concrete(self.frequencies):
+        if not is_concrete(self.frequencies) or self.frequencies.ndim != 1:  # of jit or vmap
             return f"FrequencyResponse{pairs}"
         first, last = concrete(self.frequencies)[[0, -1]]
         count = self.frequencies.size
@@ -577,7 +577,7 @@ def resonances_and_antiresonances(
 
 def _checked_frequencies(frequencies):
     frequencies = xp.atleast_1d(xp.asarray(frequencies, float))
-    if frequencies.ndim != 1:
+    if frequencies.ndim != 1 or not frequencies.size:
         raise ValueError(f"frequencies must be a list of numbers, not of shape {frequencies.shape}")
     if is_concrete(frequencies):
         values = concrete(frequencies)

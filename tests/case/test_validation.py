@@ -237,8 +237,21 @@ def test_wrong_shapes_and_types_are_refused():
     assert_refused(nothing, "beam.length is missing; give the total length in m")
     word = eqx.tree_at(lambda c: c.loads[0].mass, CASE, "heavy")
     assert_refused(word, "loads.0.mass must be one number, not 'heavy'")
+    for value, what in ((np.array(1j), "an array of complex128"), (jnp.array(1j), "an array of")):
+        complex_mass = eqx.tree_at(lambda c: c.loads[0].mass, CASE, value)
+        assert_refused(complex_mass, f"loads.0.mass must be one number, not {what}")
     limit = eqx.tree_at(lambda c: c.actuators[0].limits, CASE, jnp.ones(()))
     assert_refused(limit, "actuators.0.limits must be a list of 2 numbers, not one number")
+
+
+@pytest.mark.parametrize("value", ["heavy", 1j, np.array(1j), jnp.array(1j), np.array("heavy")])
+def test_only_real_numbers_are_taken(value):
+    """Imaginary parts were dropped, and texts gave errors of NumPy without an address."""
+    with pytest.raises(ValueError, match="loads.0.mass takes real numbers, not "):
+        jb.replace(CASE, {"loads.0.mass": value})
+    case = eqx.tree_at(lambda c: c.loads[0], CASE, jb.MovingMass(mass=value, speed=2.0))
+    with pytest.raises(ValueError, match=r"loads.0.mass must be (a real|one) number, not "):
+        jb.simulate(case)
 
 
 def test_negative_speed_and_rounded_positions_pass():

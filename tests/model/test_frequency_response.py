@@ -366,3 +366,12 @@ def test_quantities_that_an_actuator_does_not_have_are_refused():
         frequency_response(case, [1.0], [("actuators.1", "deflection@0.3")])
     with pytest.raises(ValueError, match="neither sensors nor actuators"):
         frequency_response(jb.Case(RIG_A.beam), [1.0])
+
+
+def test_responses_of_a_batch_are_printed_and_none_are_refused():
+    """Both raised where the first and last frequency were formatted."""
+    case = jb.Case(jb.Beam(0.6, 11.68, 0.535), sensors=[jb.Sensor(0.3)])
+    batch = jax.vmap(lambda f: jb.frequency_response(case, f))(np.array([10.0, 20.0]))
+    assert repr(batch).startswith("FrequencyResponse\n  force@0.3 -> sensors.0")
+    with pytest.raises(ValueError, match=r"must be a list of numbers, not of shape \(0,\)"):
+        jb.frequency_response(case, [])

@@ -86,6 +86,8 @@ def identify(
     dataset = make_dataset(case, logs)
     largest_reading = float(np.max(np.abs(dataset.measured)))
     parameters = free_parameters(dataset.cases, bounds, largest_reading)
+    if largest_reading == 0:
+        raise ValueError("all readings of the logs are 0: there is nothing to fit")
     stage_masks = [_stage_mask(parameters, stage) for stage in stages]
     least_squares = LeastSquares(dataset, parameters, loss)
     minima, start = (), None

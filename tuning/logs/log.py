@@ -84,6 +84,14 @@ class Log:
 
     def __post_init__(self):
         refuse_traced("a log", OUTSIDE, self.times, self.values)
+        shapes = np.shape(self.times), np.shape(self.values)
+        if len(shapes[1]) != 2 or shapes[0] != shapes[1][:1]:
+            raise ValueError(
+                f"{self.source}: times must be (time,) and values (time, channel), not of the"
+                f" shapes {shapes[0]} and {shapes[1]}"
+            )
+        for name in ("times", "values"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), float))
         channels = self.values.shape[1]
         if self.valid is None:
             object.__setattr__(self, "valid", np.ones(self.values.shape, bool))

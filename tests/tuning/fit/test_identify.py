@@ -251,6 +251,7 @@ FAULTS = {
         "speed and entry time",
     ),
     "no loads": (faulty(loads=()), "run.csv: no load is known, neither in the case nor in"),
+    "nothing measured": (faulty(values=0 * FLAT), "all readings of the logs are 0: there is"),
     "unlike loads": ([faulty(), faulty(loads=FORCE)], "the logs differ in the kinds of their"),
 }  # fmt: skip
 

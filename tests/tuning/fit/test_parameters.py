@@ -14,6 +14,7 @@ from tuning.fit.dataset import make_dataset
 from tuning.parameters import (
     FreeParameter,
     LogPrediction,
+    as_prior,
     free_parameters,
     readings_with_slopes,
     with_values,
@@ -228,3 +229,10 @@ def test_memory_of_derivatives_hardly_grows_with_the_log():
         lambda *numbers: readings_with_slopes.__wrapped__(*numbers, *addresses)
     ).lower(own, plan, samples, values)
     assert program.compile().memory_analysis().temp_size_in_bytes < 6e6
+
+
+@pytest.mark.parametrize("bounds", [2.0, (1, 2, 3), ("a", "b")])
+def test_bounds_are_two_numbers(bounds):
+    """Three were taken for a prior without a deviation."""
+    with pytest.raises(ValueError, match=r"bounds are two numbers, \(low, high\), not "):
+        as_prior(bounds)

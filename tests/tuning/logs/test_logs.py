@@ -64,6 +64,25 @@ def test_one_unit_for_all_channels(tmp_path):
     np.testing.assert_allclose(log.values, [[1e-3, 2e-3], [3e-3, 4e-3]])
 
 
+def unchecked_log(times, values) -> Log:
+    """A log past the check of its types, which only tests have."""
+    log = object.__new__(Log)
+    given = {"names": ("w",), "quantities": ("deflection",), "units": ("m",)}
+    for name, value in ({"times": times, "values": values} | given).items():
+        object.__setattr__(log, name, value)
+    log.__post_init__()
+    return log
+
+
+def test_shapes_of_samples_are_said_and_lists_taken():
+    """They were errors of NumPy and of lists."""
+    assert unchecked_log([0.0, 0.1], [[0.0], [1.0]]).values.shape == (2, 1)
+    message = r"times must be \(time,\) and values \(time, channel\), not of the shapes"
+    for times, values in (([0.0, 0.1], [0.0, 1.0]), ([0.0], [[0.0], [1.0]])):
+        with pytest.raises(ValueError, match=message):
+            unchecked_log(times, values)
+
+
 def test_a_log_cannot_be_changed(tmp_path):
     log = read_log(write(tmp_path, FORMATS["comma"]))
     with pytest.raises(ValueError, match="read-only"):
