@@ -226,10 +226,7 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         return breakpoints, xp.concatenate([inner, end[None]])
 
     def kinematics(self, t):
-        return self._kinematics(t, *self.cubics())
-
-    def _kinematics(self, t, breakpoints, cubics):
-        """Position, speed and acceleration at t (s), from the `cubics`."""
+        breakpoints, cubics = self.cubics()
         inside = (t >= breakpoints[0]) & (t <= breakpoints[-1])
         clipped = xp.clip(t, breakpoints[0], breakpoints[-1])
         i = xp.clip(
@@ -253,22 +250,24 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         A Newton step of value zero gives it its derivative.
         """
         passed = xp.sign(self.positions - target) * xp.sign(self.positions[0] - target) <= 0
-        last = xp.argmax(passed)
-        low, high = take(self.times, xp.maximum(last - 1, 0)), take(self.times, last)
-        start_side = xp.sign(self.positions[0] - target)
         if not is_jax(passed) and not passed.any():
             return xp.asarray(NEVER)
-        path = self.cubics()
+        last, start_side = xp.argmax(passed), xp.sign(self.positions[0] - target)
+        piece = xp.maximum(last - 1, 0)
+        start, (p, v, half_a, sixth_j) = take(self.times, piece), take(self.cubics()[1], piece)
 
         def halve(_, bracket):
             low, high = bracket
-            middle = (low + high) / 2
-            before = xp.sign(self._kinematics(middle, *path)[0] - target) == start_side
-            return xp.where(before, middle, low), xp.where(before, high, middle)
+            s = (low + high) / 2
+            before = xp.sign(p + s * (v + s * (half_a + s * sixth_j)) - target) == start_side
+            return xp.where(before, s, low), xp.where(before, high, s)
 
-        low, high = fori_loop(0, 60, halve, stop_gradient((low, high)))
-        time = (low + high) / 2
-        position, speed, _ = self._kinematics(time, *path)
+        bracket = xp.zeros(()), take(self.times, last) - start
+        low, high = fori_loop(0, 60, halve, stop_gradient(bracket))
+        time = stop_gradient(start + (low + high) / 2)
+        s = time - start
+        position = p + s * (v + s * (half_a + s * sixth_j))
+        speed = v + s * (2 * half_a + s * 3 * sixth_j)
         moving = xp.abs(speed) > 0
         step = xp.where(moving, (position - target) / xp.where(moving, speed, 1.0), 0.0)
         return xp.where(xp.any(passed), time - (step - stop_gradient(step)), NEVER)
