@@ -145,10 +145,12 @@ def _dampers(case: Case, law: SemiActive) -> _Dampers:
 
 def _descended(influence: InputInfluence, dampers: _Dampers, limits, sign):
     """Least peak (m) and forces from the signs (hold, damper) of velocities; None without any."""
-    best = None
+    best, (low, high, change) = None, limits
     for _ in range(MAX_ROUNDS):
         try:
-            forces = attaining_commands(influence, *limits, _constraints(influence, dampers, sign))
+            forces = attaining_commands(
+                influence, low, high, change, _constraints(influence, dampers, sign)
+            )
         except (ValueError, RuntimeError):  # no forces have these signs, or hardly any
             return best
         peak = float(np.abs(influence.deflection(forces)).max())
