@@ -1,7 +1,9 @@
-"""Functions of a case that are given a part of one, or the path of its file."""
+"""Functions of a case that are given a part of one, or the path of its file; other wrong types."""
 
 import subprocess
 import sys
+
+from tests.modules import ROOT
 
 SCRIPT = """
 import jaxbeam as jb
@@ -25,3 +27,19 @@ for name, others in calls.items():
 def test_it_is_said_that_a_case_is_needed(tmp_path):
     """It was said that a Beam has no `supports`. In a process without the check of types."""
     subprocess.run([sys.executable, "-c", SCRIPT], check=True, cwd=tmp_path)
+
+
+TUNING = """
+import jaxbeam as jb, tuning
+case, loads = jb.load_case("examples/controlled_rig/case.toml"), {"loads.0.mass": 0.25}
+try:
+    tuning.tune(case, {"controller.gains.0": None}, tuning.LoadCases((loads,)), lambda x: 0.0)
+except TypeError as error:
+    assert "objective must be a tuning.Objective, not function; a function of" in str(error), error
+else:
+    raise AssertionError
+"""
+
+
+def test_it_is_said_that_an_objective_is_no_function():
+    subprocess.run([sys.executable, "-c", TUNING], check=True, cwd=ROOT)
