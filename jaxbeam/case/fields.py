@@ -52,7 +52,7 @@ def is_real(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return all(map(is_real, value))
     if hasattr(value, "dtype"):
-        return value.dtype != jax.dtypes.float0 and np.dtype(value.dtype).kind in "biuf"
+        return np.dtype(value.dtype).kind in "biuf"
     return isinstance(value, int | float)
 
 

@@ -259,12 +259,13 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         def halve(_, bracket):
             low, high = bracket
             s = (low + high) / 2
-            before = xp.sign(p + s * (v + s * (half_a + s * sixth_j)) - target) == start_side
+            # At the target, to rounding, counts as before: a load that stops there has not passed.
+            before = (p + s * (v + s * (half_a + s * sixth_j)) - target) * start_side >= 0
             return xp.where(before, s, low), xp.where(before, high, s)
 
-        bracket = xp.zeros(()), take(self.times, last) - start
-        low, high = fori_loop(0, 60, halve, stop_gradient(bracket))
-        time = stop_gradient(start + (low + high) / 2)
+        end = take(self.times, last)
+        low, high = fori_loop(0, 60, halve, stop_gradient((xp.zeros(()), end - start)))
+        time = stop_gradient(xp.minimum(start + (low + high) / 2, end))
         s = time - start
         position = p + s * (v + s * (half_a + s * sixth_j))
         speed = v + s * (2 * half_a + s * 3 * sixth_j)

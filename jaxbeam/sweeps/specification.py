@@ -128,7 +128,8 @@ class SweepSpecification:
     def _sizes(self) -> RunSizes:
         """Sizes of the runs, from which their memory is computed."""
         swept = [values for name, values in self.axes.items() if name.endswith(".speed")]
-        speeds = [float(concrete(load.speed)) for load in self.case.loads if hasattr(load, "speed")]
+        given = [getattr(load, "speed", None) for load in self.case.loads]
+        speeds = [float(concrete(speed)) for speed in given if speed is not None]
         speeds = np.concatenate([speeds, *swept])
         return run_sizes(self.case, speeds, self.histories, bool(self.profiles))
 

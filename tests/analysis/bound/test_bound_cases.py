@@ -134,7 +134,8 @@ def reference_influence() -> InputInfluence:
         unit_states[:, k] += transition[:size, size : size + 2]
         unforced[k + 1], response[k + 1] = state[:n], unit_states[:n]
     rows, times = np.array([shapes(x) for x in SENSORS]), np.arange(HOLDS + 1) * KNOWN["period_s"]
-    return InputInfluence(rows, times[:-1], times, unforced, response)
+    no_velocities = np.zeros((HOLDS, 0)), np.zeros((HOLDS, 0, HOLDS, 2))
+    return InputInfluence(rows, times[:-1], times, unforced, response, *no_velocities)
 
 
 def test_linear_program_has_the_bound_of_the_reference():
