@@ -199,8 +199,11 @@ class Comparison(TableViews, Module):
         """Sentence on what the dampers of a semi-active controller attain; empty for others."""
         if name not in self.damper_peaks:
             return ""
-        best = self.damper_peaks[name]
-        share = (best.uncontrolled - self.metrics[name].peak) / (best.uncontrolled - best.peak)
+        best, peak = self.damper_peaks[name], self.metrics[name].peak
+        attainable = best.uncontrolled - best.peak
+        if not attainable > 0 or np.isnan(peak):  # dampers of no effect, or a run that diverges
+            return best.verdict
+        share = (best.uncontrolled - peak) / attainable
         return f"{best.verdict}; the law achieves {share:.1%} of this"
 
     def loop_summary(self, name: str) -> str:

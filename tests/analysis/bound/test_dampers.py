@@ -88,6 +88,10 @@ def test_a_comparison_says_what_the_dampers_attain():
     assert found.bound.peak < clipped.peak < found.metrics["clipped"].peak
     assert clipped.peak <= found.damper_peaks["constant"].peak * (1 + 1e-9)
     assert f"clipped: {clipped.verdict}; the law achieves " in " ".join(found.remarks)
+    without_effect = dataclasses.replace(CASE.controller, min_damping=0.0, max_damping=0.0)
+    none = compare(free, {"none": without_effect})
+    assert none.damper_summary("none") == none.damper_peaks["none"].verdict
+    assert none.damper_peaks["none"].peak == none.damper_peaks["none"].uncontrolled
     # A damper of one rate has one run.
     constant = found.damper_peaks["constant"]
     assert_allclose(constant.peak, found.metrics["constant"].peak, rtol=1e-3)
