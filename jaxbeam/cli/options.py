@@ -84,8 +84,8 @@ class OutputOptions(PrintOptions):
 
     overwrite: Annotated[bool, Parameter("--overwrite", help="Replace existing files.")] = False
 
-    def check_outputs(self, *paths: Path | None) -> None:
-        """Check, before any work, that files can be written.
+    def check_outputs(self, *paths: Path | None, others: str = "") -> None:
+        """Check, before any work, that files can be written; `others` are further ways out.
 
         Raises FileNotFoundError if the folder does not exist, FileExistsError if the file exists
         and `--overwrite` is not given.
@@ -94,7 +94,8 @@ class OutputOptions(PrintOptions):
             if not path.parent.is_dir():
                 raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
             if path.exists() and not self.overwrite:
-                raise FileExistsError(f"{path} exists; choose another name or add --overwrite")
+                ways = f"choose another name or add {others}--overwrite"
+                raise FileExistsError(f"{path} exists; {ways}")
 
 
 @Parameter(name="*")

@@ -55,6 +55,10 @@ REFUSED = [
     ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
     ("simulate case.toml -o none/out.nc", "there is no folder none to write out.nc to"),
     ("simulate case.toml -o old.nc", "old.nc exists; choose another name or add --overwrite"),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 -o old.zarr",
+        "old.zarr exists; choose another name or add --resume or --overwrite",
+    ),
     ("simulate case.toml --animate out.avi", "an animation is written to a file of .gif or .mp4"),
     (
         "simulate case.toml --picture out.jpg",
@@ -136,7 +140,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("line", "message"), REFUSED)
 def test_wrong_command_lines_are_refused(folder, refused, line, message):
-    (folder / "old.nc").touch()
+    for name in ("old.nc", "old.zarr"):
+        (folder / name).touch()
     assert message in refused(line)
 
 

@@ -103,7 +103,8 @@ def sweep(
         "--plot draws peaks over one or two parameters with several values; leave it out",
     )
     if not resume:
-        options.check_outputs(output, picture)
+        is_store = output is not None and output.suffix == ".zarr"
+        options.check_outputs(output, picture, others="--resume or " if is_store else "")
     parsed_case = options.read(case, judged="")
     if run_up:
         parsed_case = _with_run_up(parsed_case, values)
