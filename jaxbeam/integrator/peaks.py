@@ -77,14 +77,7 @@ class RunningPeaks(Module):
 
     def without(self, failed: Bool[Array, " batch"]) -> "RunningPeaks":
         """Running peaks in which diverged runs have no peak and no contact force."""
-        finite = self.finite & ~failed
-        contact = xp.where(finite, self.lowest_contact_force, xp.nan)
-        lost = xp.where(finite, self.contact_lost_time, NEVER)
-        return eqx.tree_at(
-            lambda own: (own.lowest_contact_force, own.contact_lost_time, own.finite),
-            self,
-            (contact, lost, finite),
-        )
+        return eqx.tree_at(lambda own: own.finite, self, self.finite & ~failed)
 
     def with_contact(
         self, lowest: Float[Array, "load batch"], lost_time: Float[Array, "load batch"]
@@ -97,8 +90,10 @@ class RunningPeaks(Module):
 
     def peaks(self) -> Peaks:
         """Peaks at the end of the runs, with the batch axis first."""
-        lost = xp.where(self.contact_lost_time < NEVER, self.contact_lost_time, xp.nan)
-        return Peaks(*(part.T for part in (*self.refined_peak(), self.lowest_contact_force, lost)))
+        lowest = xp.where(self.finite, self.lowest_contact_force, xp.nan)
+        is_lost = self.finite & (self.contact_lost_time < NEVER)
+        lost = xp.where(is_lost, self.contact_lost_time, xp.nan)
+        return Peaks(*(part.T for part in (*self.refined_peak(), lowest, lost)))
 
 
 @jax.named_scope("running_peaks")
@@ -175,7 +170,8 @@ def update_peaks(
         start,
         length,
     )
-    finite = running_peaks.finite & xp.all(xp.isfinite(largest), axis=0)
+    # By a sum: maxima of XLA on CPUs pass over NaN in arrays of several runs.
+    finite = running_peaks.finite & xp.isfinite(xp.sum(samples, axis=(0, 1, 2)))
     return eqx.tree_at(
         lambda b: (b.lowest_contact_force, b.contact_lost_time, b.finite),
         running_peaks,

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -74,6 +75,10 @@ from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 
 MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough
 LARGEST_SHORTENING = 4.0  # largest factor of one of them
+SINGLE_PRECISION = (
+    "JAX computes in single precision, in which a run is less exact than its record says: call"
+    ' jax.config.update("jax_enable_x64", True) first, and leave JAX_ENABLE_X64 unset'
+)
 NO_DERIVATIVE = (
     "{} of a record has no derivative, as it tells errors of steps that jump with the numbers of a"
     " case: leave it out of what is differentiated, or compare several values"
@@ -104,9 +109,10 @@ def simulate(
     `plan` is for the times and the parts of one case, and for other numbers near those of it; the
     error that it states is for its own.
 
-    Raises ValueError for an invalid case or times and for a plan of another case, RuntimeError if
-    no time step meets the tolerance; warns (ContactLossWarning) of negative contact forces, and,
-    unless a `plan` is given, of what looks wrong, such as units (PlausibilityWarning).
+    Raises ValueError for an invalid case or times, for a plan of another case, and for traced
+    numbers where JAX computes in single precision, RuntimeError if no time step meets the
+    tolerance; warns (ContactLossWarning) of negative contact forces, and, unless a `plan` is given,
+    of what looks wrong, such as units (PlausibilityWarning).
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -508,7 +514,11 @@ def integration_setup(
 
     The input `policy` is that of the case if left out. Peaks are those of what the `monitored`
     sensors measure, upwards, then downwards; the last are at the absorbers (`monitored_sensors`).
+
+    Raises ValueError for traced numbers in single precision.
     """
+    if any_jax(case, times) and not jax.config.jax_enable_x64:
+        raise ValueError(SINGLE_PRECISION)
     layout = plan.shapes.layout
     loads = load_set(case, layout)
     if case.controller is None:

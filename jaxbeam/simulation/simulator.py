@@ -42,8 +42,8 @@ class Simulator(Module):
     run (see `jaxbeam.simulation.record.Result`).
 
     Raises ValueError for an invalid case, unknown addresses, ranges in which positions change their
-    order, when called with too few or too many values, and outside of transformations with values
-    beyond their ranges.
+    order, when called with too few or too many values or in single precision, and outside of
+    transformations with values beyond their ranges.
 
     >>> import jax, jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)

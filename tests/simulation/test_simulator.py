@@ -113,6 +113,29 @@ def test_a_run_under_jit_says_what_is_wrong_with_it():
         SIMULATOR([0.5])
 
 
+def test_a_run_that_is_not_finite_has_no_peaks_in_a_batch():
+    """Its peak was 0 and its lowest contact force infinite: XLA's maxima pass over NaN."""
+
+    def numbers(mass):
+        record = SIMULATOR([mass])
+        return record.peak_deflection[0], record.lowest_contact_force[0], record.result
+
+    peaks, forces, results = jax.jit(jax.vmap(numbers))(np.array([0.2, np.nan]))
+    assert_allclose(peaks, [peak_of(0.2), np.nan], rtol=1e-6)
+    assert np.array_equal(np.isnan(forces), [False, True])
+    assert jb.Result.DIVERGED in jb.Result(int(results[1]))
+
+
+def test_single_precision_is_refused():
+    """The record said 2e-8 where peaks were 1.5e-6 off."""
+    with jax.enable_x64(False):
+        for function in (peak_of, lambda mass: SIMULATOR([mass]).peak_deflection[0]):
+            for transformed in (jax.jit(function), jax.grad(function)):
+                with pytest.raises(ValueError, match=r"single precision.*jax_enable_x64"):
+                    transformed(0.2)
+        assert_allclose(peak_of(0.2), SIMULATOR(0.2).peak_deflection[0], rtol=1e-6)
+
+
 WRONG = {
     "unknown rigidity": (
         lambda x: jb.simulate(jb.replace(CASE, {RIGIDITY: x})),
