@@ -10,6 +10,7 @@ from jaxtyping import Float
 RATES = ("sample_rate", "sampling_rate", "samplerate", "fs", "rate")  # Hz
 STEPS = ("dt", "time_step", "wf_increment")  # s
 STARTS = ("start_time", "t0", "wf_start_offset")  # s
+CUT = 0.05  # of the time in common: more that is cut off is said, also of slow channels
 SAME = 0.01  # of a step: largest difference of equal start times, rounded to microseconds
 
 
@@ -65,7 +66,7 @@ def join_channels(
         joined[name] = CubicSpline(at, values, axis=0)(np.clip(times, at[0], at[-1]))
         interpolated.append(f"{name} ({1 / own:.6g} Hz, {start:g} s)")
     said = []
-    if first > slack or max(ends.values()) - last > longest - slack:
+    if first > slack or max(ends.values()) - last > min(longest - slack, CUT * last):
         said.append(
             f"its channels have different times ({_shortened(spans)}): aligned by them, and read"
             f" from {times[0]:g} to {times[-1]:g} s, which they have in common"

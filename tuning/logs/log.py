@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.fields import OUTSIDE, refuse_traced
 from jaxbeam.case.loads.base import AbstractLoad
 from tuning.logs.readers import LogTable, is_time_name, parse_heading
-from tuning.logs.units import UNITS
+from tuning.logs.units import is_of_time
 
 GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
@@ -356,7 +356,7 @@ def with_times(path: Path, table: LogTable, rate: float | None, time: str | None
         (
             name
             for name, unit in zip(table.names, table.units, strict=True)
-            if is_time_name(name) or (unit in UNITS and UNITS[unit].quantity == "time")
+            if is_time_name(name, unit) or is_of_time(unit)
         ),
         None,
     )  # fmt: skip

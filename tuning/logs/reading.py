@@ -54,7 +54,7 @@ from tuning.logs.log import Log, LogWarning, check_samples, doubts, with_named_c
 from tuning.logs.quality import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import EPOCH, LATEST, date_of, shown
-from tuning.logs.units import UNITS, UNITS_OF_CONDITIONS, is_unit, transducer_unit, unit
+from tuning.logs.units import UNITS_OF_CONDITIONS, is_of_time, is_unit, transducer_unit, unit
 
 _KEYS = {"loads": TABLES, "columns": TABLE, "time": WORD, "runs": TABLE}
 _COLUMN_KEYS = {
@@ -474,11 +474,12 @@ def _time_column(path, table: LogTable, requested: str | None) -> str:
         return requested
     if table.time is not None:
         return table.time
-    for name in table.names:
-        if is_time_name(name):
+    units = dict(zip(table.names, table.units, strict=True))
+    for name, text in units.items():
+        if is_time_name(name, text):
             return name
-    for name, text in zip(table.names, table.units, strict=True):
-        if text in UNITS and UNITS[text].quantity == "time":
+    for name, text in units.items():
+        if is_of_time(text):
             return name
     raise ValueError(
         f"{path}: no column is called time or has a unit of time; say which it is, "

@@ -35,6 +35,7 @@ UNITS = {
     "mm": Unit("m", 1e-3, "deflection"),
     "um": Unit("m", 1e-6, "deflection"),
     "in": Unit("m", 0.0254, "deflection"),
+    "mil": Unit("m", 2.54e-5, "deflection"),
     "ft": Unit("m", 0.3048, "deflection"),
     "m/s": Unit("m/s", 1.0, "velocity"),
     "cm/s": Unit("m/s", 1e-2, "velocity"),
@@ -58,6 +59,9 @@ UNITS = {
     "um/m": Unit("1", 1e-6, "strain"),
     "N": Unit("N", 1.0, "force"),
     "kN": Unit("N", 1e3, "force"),
+    "MN": Unit("N", 1e6, "force"),
+    "lbf": Unit("N", 4.4482216152605, "force"),  # exact by definition
+    "kip": Unit("N", 4448.2216152605, "force"),
     "V": Unit("V", 1.0, "voltage"),
     "mV": Unit("V", 1e-3, "voltage"),
     "mV/V": Unit("1", 1e-3, "voltage ratio"),  # of bridges of strain gauges, over their supply
@@ -77,10 +81,13 @@ _SPELLINGS = {
     **dict.fromkeys(("days", "day", "Tage"), "d"),
     **dict.fromkeys(("count", "Counts", "cts", "LSB", "digits", "digit"), "counts"),
     "inch": "in",
+    "mils": "mil",
+    "kips": "kip",
     **dict.fromkeys(("Gal", "gal"), "cm/s^2"),  # of recorders of earthquakes
     "g_n": "g",
     "°": "deg",
-    "ustrain": "ue",
+    **dict.fromkeys(("m/s/s", "m/sec^2", "m/sec2"), "m/s^2"),
+    **dict.fromkeys(("ustrain", "uStrain"), "ue"),
     "microstrain": "ue",
     "uε": "ue",
     "ε": "strain",
@@ -123,6 +130,16 @@ def is_unit(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_of_time(text: str | None) -> bool:
+    """Whether a text is a unit of time.
+
+    >>> from tuning.logs.units import is_of_time
+    >>> is_of_time("sec"), is_of_time("mm"), is_of_time(None)
+    (True, False, False)
+    """
+    return text is not None and is_unit(text) and unit(text).quantity == "time"
 
 
 _SENSITIVITY = re.compile(

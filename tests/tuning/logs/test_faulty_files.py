@@ -526,6 +526,83 @@ def test_a_clock_that_is_set_by_an_hour_goes_on(tmp_path, moments, way):
     np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
 
 
+def test_an_hour_without_samples_is_no_clock_set_forward(tmp_path):
+    """At a full hour by day: the logger paused."""
+    begin = datetime(2024, 3, 31, 9, 59, 59)
+    later = TIMES + np.where(TIMES >= 1.0, 3600.0, 0.0)
+    cells = [(begin + timedelta(seconds=float(t))).isoformat() for t in later]
+    rows = [f"{cell},{signal(t):.6f}" for cell, t in zip(cells, TIMES, strict=True)]
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_warned(tmp_path / "run.csv", "times jump by 3600 s")
+    np.testing.assert_allclose(log.times, later, atol=1e-9)
+
+
+def test_a_date_whose_day_may_be_its_month_is_left_out(tmp_path):
+    """The fifth of June or the sixth of May; times are the same, and 5/5 is one day."""
+    rows = [f"05/06/2024 09:30:{t:.3f} AM,{signal(t):.6f}" for t in TIMES + 10.0]
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_warned(tmp_path / "run.csv", "day or the month .* in 05/06/2024 .* is ambiguous")
+    assert log.start == "09:30:10.000"
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows).replace("/06", "/05"))
+    assert read_log(tmp_path / "run.csv").start == "2024-05-05T09:30:10"
+
+
+def test_milliseconds_after_a_colon(tmp_path):
+    rows = [f"09:59:{t:.3f},{signal(t):.6f}".replace(".", ":", 1) for t in TIMES + 10.0]
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows) + "\n")
+    np.testing.assert_allclose(read_log(tmp_path / "run.csv").times, TIMES, atol=1e-9)
+
+
+def test_commas_of_thousands_are_no_decimal_ones(tmp_path):
+    """2,000 in a cell of a file separated by commas, or of a workbook, is 2 or 2000."""
+    path, head = tmp_path / "run.csv", "time [s],w [mm]\n"
+    path.write_text(head + '0.0,"2,000"\n0.1,950\n0.2,"-1,250,000"\n')
+    with pytest.raises(ValueError, match=r"run.csv, line 2: the comma in '2,000' is a decimal one"):
+        read_log(path)
+    path.write_text(head + '"0,0","2,000"\n"0,1","950,5"\n')
+    np.testing.assert_allclose(read_log(path).values[:, 0], [2e-3, 0.9505])
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in (["time [s]", "w [mm]"], [0.0, "2,000"], [0.1, "0,5"]):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    np.testing.assert_allclose(read_log(tmp_path / "run.xlsx").values[:, 0], [2e-3, 5e-4])
+    book.active["B3"] = "1,500"
+    book.save(tmp_path / "run.xlsx")
+    with pytest.raises(ValueError, match="line 2: the comma in '2,000' is a decimal one"):
+        read_log(tmp_path / "run.xlsx")
+
+
+def test_a_temperature_called_t_is_no_time(tmp_path):
+    """Of a LabVIEW file with a rate; it is sampled once a second, to 1 s."""
+    path = tmp_path / "run.tdms"
+    tdms(
+        path,
+        {
+            "a": (signal(TIMES), clock()),
+            "T": ([20.0, 22.0], clock(step=1.0) | {"unit_string": "degC"}),
+        },
+    )
+    log = read_warned(path, "read from 0 to 1 s, which they have in common")
+    assert log.names == ("a",) and log.times[-1] == pytest.approx(1.0)
+    assert log.conditions == (("T (degC)", pytest.approx(21.0)),)
+    (tmp_path / "run.csv").write_text("T [°C],w [mm]\n20,1\n21,2\n")
+    log = read_log(tmp_path / "run.csv", rate=100.0)
+    assert log.names == ("w",) and log.times[1] == pytest.approx(0.01)
+    (tmp_path / "run.csv").write_text("T [°C],elapsed [sec],w [mm]\n20,0,1\n21,0.5,2\n")
+    assert read_log(tmp_path / "run.csv").times[1] == 0.5
+
+
+def test_dates_of_a_labview_file(tmp_path):
+    """A channel of dates, a microsecond rounded, beside one without a clock."""
+    dates = np.datetime64("2024-03-31T00:59:50", "us") + (1e6 * TIMES).astype("timedelta64[us]")
+    tdms(tmp_path / "run.tdms", {"when": (dates, {}), "w": (signal(TIMES), {})})
+    log = read_log(tmp_path / "run.tdms")
+    assert log.names == ("w",) and log.start == "2024-03-31T00:59:50.000+00:00"
+    np.testing.assert_allclose(log.times, TIMES, atol=1.1e-6)
+
+
 @pytest.mark.parametrize("rate", [200.0, 51.2])
 def test_stamps_of_whole_seconds_are_counted(tmp_path, rate):
     times = np.arange(int(12 * rate)) / rate

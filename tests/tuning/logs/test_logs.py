@@ -247,6 +247,9 @@ def test_long_names_and_units_are_refused_in_a_sentence(tmp_path):
         ("°", "rad", math.pi / 180, "slope"),
         ("µε", "1", 1e-6, "strain"),
         ("kN", "N", 1e3, "force"),
+        ("kips", "N", 1e3 * 0.45359237 * 9.80665, "force"),
+        ("mils", "m", 2.54e-5, "deflection"),
+        ("m/sec²", "m/s^2", 1.0, "acceleration"),
         (" ms ", "s", 1e-3, "time"),
     ],
 )

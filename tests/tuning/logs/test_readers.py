@@ -617,6 +617,8 @@ TEXTS = {
     "spaces, decimal comma": "t a b\ns mm mm\n0,0 1,0 2,0\n0,1 3,0 4,0\n",
     "comments within": "t [s];a [mm];b [mm]\n0,0;1,0;2,0\n% paused\n// again\n0,1;3,0;4,0\n",
     "several headings": "place;left;right\nt (s);a (mm);b (mm)\n0;1;2\n0,1;3;4\n",
+    "merged headings": "bridge;;\nt [s];deflection [mm];\n;a;b\n0;1;2\n0,1;3;4\n",
+    "merged headings, units below": "t,deflection,\n,a,b\ns,mm,mm\n0,1,2\n0.1,3,4\n",
 }
 
 

@@ -28,7 +28,7 @@ from tuning.logs.readers.table import (
 from tuning.logs.units import is_unit
 
 _CLOCK = (
-    r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2}(?:[.,]\d+)?))?"
+    r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2}(?:[.,:]\d+)?))?"
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -41,6 +41,7 @@ _ZONE = rf"(?P<zone>{'|'.join(_ZONES)}|[-+]\d{{2}}:?\d{{2}})?"
 _STAMP = re.compile(rf"{_DATE}[T ]\s*{_CLOCK}\s*{_ZONE}")
 _DAY, _TIME_OF_DAY = re.compile(_DATE), re.compile(_CLOCK)
 DAY, HOUR = 86400.0, 3600.0  # s
+FRIDAY, LATEST_CHANGE = 4, 4  # first day of the week, and last hour, of clocks set forward
 LEAST_SECONDS = 4  # number of stamps without fractions from which the samples in one are counted
 
 
@@ -98,6 +99,12 @@ def seconds_of(path: Path, column: str, cells: Sequence[str], lines: Sequence[in
         if dated:
             moments = _moments(found)
             start = moments[0].isoformat()
+            if _order(found) is None and moments[0].date() == moments[-1].date():
+                start = moments[0].time().isoformat(timespec="milliseconds")
+                said.append(
+                    f"whether the day or the month comes first in {cells[0].strip()} is ambiguous:"
+                    " times are seconds from the first, and their date is left out"
+                )
             seconds = np.array([(one - moments[0]).total_seconds() for one in moments])
         else:
             own = np.array([_of_day(one) for one in found])
@@ -115,6 +122,9 @@ def seconds_of(path: Path, column: str, cells: Sequence[str], lines: Sequence[in
             if usual > HOUR / 10 or after.minute or after.second > max(usual, 0.5):
                 continue
             forward = steps[i] > 0
+            at_night = moments[i + 1].hour <= LATEST_CHANGE and moments[i + 1].weekday() >= FRIDAY
+            if forward and not at_night:  # an hour without samples
+                continue
             seconds[i + 1 :] += -HOUR if forward else HOUR
             said.append(
                 f"the clock is set {'forward' if forward else 'back'} by an hour in line"
@@ -157,6 +167,8 @@ def _moments(found: Sequence[re.Match]) -> list[datetime]:
     Raises ValueError if day and month are ambiguous.
     """
     order = _order(found)
+    if order is None and len({(one["a"], one["b"]) for one in found}) == 1:
+        order = "dmy"  # one day, whichever
     if order is not None:
         return [_moment(one, order) for one in found]
     tried = [[_moment(one, order) for one in found] for order in ("dmy", "mdy")]
@@ -184,7 +196,7 @@ def _order(found: Sequence[re.Match]) -> str | None:
         return "dmy"
     if any(_number(one["b"]) > 12 for one in found):
         return "mdy"
-    return "dmy" if len({(one["a"], one["b"]) for one in found}) == 1 else None
+    return "dmy" if found[0]["a"] == found[0]["b"] else None
 
 
 def _number(part: str) -> int:
@@ -205,7 +217,7 @@ def _of_day(found: re.Match) -> float:
         hour = hour % 12 + (12 if found["half"].lower().startswith("p") else 0)
     if hour > 24 or minute > 59:
         raise ValueError(f"there is no time {hour}:{minute:02}")
-    return 3600.0 * hour + 60.0 * minute + float((found["second"] or "0").replace(",", "."))
+    return 3600.0 * hour + 60.0 * minute + float(re.sub("[,:]", ".", found["second"] or "0"))
 
 
 def _zone(text: str | None) -> timezone | None:
@@ -217,6 +229,7 @@ def _zone(text: str | None) -> timezone | None:
     return timezone(timedelta(minutes=-minutes if text[0] == "-" else minutes))
 
 
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 MAX_HEADING_ROWS = 100  # rows at the top among which the first row of numbers is searched
 _BRACKETS = re.compile(r"^[\[(](.*)[\])]$")
 
@@ -256,6 +269,9 @@ def find_headings(rows: Sequence[Sequence[str]]) -> Headings:
         notes = (f"{first} lines above the numbers are skipped",) if first else ()
         return Headings((), (), first, notes)
     cells = [from_text_cell(cell.strip()) for cell in rows[head]]
+    if head + 1 < first and "" in cells[1:width]:
+        merged = _with_names_below(cells[:width], rows[head + 1])
+        head, cells = (head, cells) if merged is None else (head + 1, merged)
     while len(cells) > 1 and not cells[-1]:
         cells.pop()
     names, units = zip(*map(parse_heading, cells), strict=True)
@@ -270,6 +286,25 @@ def find_headings(rows: Sequence[Sequence[str]]) -> Headings:
     skipped = after - 1 - has_unit_row
     notes = (f"{skipped} lines other than the headings are skipped",) if skipped else ()
     return Headings(names, units, after, notes)
+
+
+def _with_names_below(cells: Sequence[str], below: Sequence[str]) -> list[str] | None:
+    """Headings of which some are merged over several columns, named in the row below; else None.
+
+    Time [s] | Acceleration [g] |    | Strain [um/m]
+             | a1               | a2 | s1                gives   Time [s], a1 [g], a2 [g], s1 [um/m]
+    """
+    named = [from_text_cell(cell.strip()) for cell in below]
+    named += [""] * (len(cells) - len(named))
+    both = list(zip(cells, named, strict=False))
+    if _is_unit_row(below) or any(not own and not name for own, name in both):
+        return None
+    found, unit = [], None
+    for own, name in both:
+        unit = parse_heading(own)[1] if own else unit
+        has_own = not name or parse_heading(name)[1]
+        found.append((name or own) if has_own or not unit else f"{name} [{unit}]")
+    return found
 
 
 def is_numeric(row: Sequence[str]) -> bool:
@@ -302,7 +337,7 @@ def _is_heading(row, width: int) -> bool:
 def _names_columns(row) -> bool:
     """Whether one of the cells is the name of a column of times, or has a unit of the table."""
     headings = [parse_heading(cell) for cell in row]
-    return any(is_time_name(name) or (unit and is_unit(unit)) for name, unit in headings)
+    return any(is_time_name(name, unit) or (unit and is_unit(unit)) for name, unit in headings)
 
 
 def _is_unit_row(row) -> bool:
@@ -348,7 +383,7 @@ def table_of_rows(
         began, said, units[i] = began or found.start, (*said, *found.said), "s"
         for row, second in zip(rows, found.seconds, strict=True):
             row[i] = repr(second)
-    has_commas = may_have_commas and _has_decimal_comma(source, others, lines)
+    has_commas = _has_decimal_comma(source, others, lines, may_have_commas)
     values = parse_numbers(source, names, rows, lines, has_commas)
     return LogTable(
         tuple(names), tuple(units), values, np.array(lines), notes=headings.notes,
@@ -357,13 +392,25 @@ def table_of_rows(
     )  # fmt: skip
 
 
-def _has_decimal_comma(source, rows, lines) -> bool:
-    """Whether cells have decimal commas. Raises ValueError for a file with points as well."""
-    comma = next((i for i, row in enumerate(rows) if any("," in cell for cell in row)), None)
+def _has_decimal_comma(source, rows, lines, are_usual: bool) -> bool:
+    """Whether cells have decimal commas, which `are_usual` unless the comma separates columns.
+
+    Raises ValueError for a file with points as well, and for commas that are not usual and may
+    all separate thousands.
+    """
+    commas = [(i, cell) for i, row in enumerate(rows) for cell in row if "," in cell]
     point = next((i for i, row in enumerate(rows) if any("." in cell for cell in row)), None)
-    if comma is not None and point is not None:
+    if not commas:
+        return False
+    first, cell = commas[0]
+    if are_usual and point is not None:
         raise ValueError(
-            f"{source}, lines {lines[comma]} and {lines[point]}: numbers have both decimal commas "
+            f"{source}, lines {lines[first]} and {lines[point]}: numbers have both decimal commas "
             "and decimal points; write one of them throughout, without thousands separators"
         )
-    return comma is not None
+    if not are_usual and all(_THOUSANDS.fullmatch(cell.strip()) for _, cell in commas):
+        raise ValueError(
+            f"{source}, line {lines[first]}: the comma in {shown(cell)} is a decimal one or "
+            "separates thousands; write numbers with decimal points, without thousands separators"
+        )
+    return True

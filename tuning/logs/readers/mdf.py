@@ -48,7 +48,7 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
     for number, (times, channels) in groups.items():
         for signal in channels:
             name = signal.name
-            if name in arrays or is_time_name(parse_heading(name)[0]):
+            if name in arrays or is_time_name(parse_heading(name)[0], signal.unit):
                 name = f"{name} of group {number}"
             arrays[name], units[name] = _samples(signal, times), signal.unit or None
             clocks[name] = times

@@ -40,7 +40,7 @@ def read_netcdf(path: Path) -> dict[str, LogTable]:
                     units[name] = text_attribute(getattr(variable, "units", None))
     except Exception as error:  # scipy raises many types for damaged files
         raise damaged_file_error(path, error) from None
-    runs = _along_times(runs)
+    runs = _along_times(runs, units)
     tables = {}
     for dimension, arrays in runs.items():
         source = f"{path}, dimension {dimension!r}" if len(runs) > 1 else str(path)
@@ -48,12 +48,12 @@ def read_netcdf(path: Path) -> dict[str, LogTable]:
     return tables if len(tables) != 1 else {"": next(iter(tables.values()))}
 
 
-def _along_times(runs: dict[str, dict]) -> dict[str, dict]:
+def _along_times(runs: dict[str, dict], units: dict[str, str | None]) -> dict[str, dict]:
     """Runs that have times: of variables along other dimensions these are not the times."""
     with_times = {
         dimension: arrays
         for dimension, arrays in runs.items()
-        if any(is_time_name(name) for name in (dimension, *arrays))
+        if any(is_time_name(name, units.get(name)) for name in (dimension, *arrays))
     }
     return with_times or runs
 

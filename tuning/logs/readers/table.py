@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.runtime.input_file import check_input, describe_content, read_input
 from tuning.logs.clocks import Clock, join_channels
-from tuning.logs.units import is_unit
+from tuning.logs.units import UNITS_OF_CONDITIONS, is_unit
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _QUOTIENT = re.compile(r"^(?P<name>[^/]*?\S)(\s*/\s*|\s+in\s+)(?P<unit>\S+)$")
@@ -104,7 +104,8 @@ def table_of(
     Raises ValueError if there are no numbers.
     """
     arrays = {name: np.asarray(array, float) for name, array in arrays.items()}
-    has_times = any(is_time_name(parse_heading(label)[0]) for label in arrays)
+    own_times = [label for label in arrays if _is_time_label(label, units)]
+    has_times = bool(own_times)
     times, said, start = None, list(warnings), ""
     if clocks and not has_times:
         timed = {label: upright(arrays[label]) for label in arrays if label in clocks}
@@ -114,7 +115,7 @@ def table_of(
             times, joined, moved = join_channels(source, timed, own)
             arrays, said = arrays | joined, [*said, *moved]
             start = date_of(origin + min(one.start for one in own.values()) + float(times[0]))
-    length = _length(arrays) if times is None else times.size
+    length = _length(arrays, own_times) if times is None else times.size
     if length < 2:
         raise ValueError(f"{source}: there is no list of numbers in it")
     names, found, columns, left_out, lost = [], [], [], [], False
@@ -165,16 +166,20 @@ def upright(array: np.ndarray) -> np.ndarray:
     return array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
 
 
-def is_time_name(name: str) -> bool:
-    """Whether a name is one of a column of times."""
-    return name.lower() in TIME_NAMES
+def is_time_name(name: str, unit: str | None = None) -> bool:
+    """Whether a name is one of a column of times, not of a temperature T (°C)."""
+    return name.lower() in TIME_NAMES and unit not in UNITS_OF_CONDITIONS
 
 
-def _length(arrays: Mapping[str, np.ndarray]) -> int:
+def _is_time_label(label: str, units: Mapping[str, str | None]) -> bool:
+    name, unit = parse_heading(label)
+    return is_time_name(name, units.get(label) or unit)
+
+
+def _length(arrays: Mapping[str, np.ndarray], times: Sequence[str]) -> int:
     """Number of samples: that of the times, or else that of most arrays."""
-    for label, array in arrays.items():
-        if is_time_name(parse_heading(label)[0]):
-            return max(array.shape, default=0)
+    if times:
+        return max(arrays[times[0]].shape, default=0)
     sizes = [max(array.shape) for array in arrays.values() if array.ndim and array.size > 1]
     return max(sizes, key=lambda size: (sizes.count(size), size), default=0)
 
@@ -246,7 +251,7 @@ def parse_numbers(
     """Numbers in the cells of a table; cells that are empty or say OVR or the like become NaN.
 
     `lines` are the line numbers of the rows. Raises ValueError, naming file, line and column, for a
-    cell that is no number.
+    cell that is no number, and for commas of which it is not sure that they are decimal ones.
     """
     if not rows:
         raise ValueError(f"{path}: the log is empty: there are column names but no rows")

@@ -1,6 +1,7 @@
 """LabVIEW TDMS files (.tdms), by npTDMS: each group of channels is a run."""
 
 import contextlib
+import dataclasses
 import logging
 import warnings
 from pathlib import Path
@@ -13,20 +14,22 @@ from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
     damaged_file_error,
+    date_of,
     is_time_name,
     table_of,
     text_attribute,
 )
 
 MAGIC = b"TDSm"
+EPOCH, SECOND = np.datetime64(0, "s"), np.timedelta64(1, "s")
 
 
 def read_tdms(path: Path) -> dict[str, LogTable]:
     """Tables of a TDMS file: one run for each group with numbers, by the name of the group.
 
-    Times are a channel called time, or follow from the waveform properties `wf_increment`,
-    `wf_start_time` and `wf_start_offset` of the channels, which are aligned by them, with a
-    warning; units are the property `unit_string`.
+    Times are a channel called time, or of dates, or follow from the waveform properties
+    `wf_increment`, `wf_start_time` and `wf_start_offset` of the channels, which are aligned by
+    them, with a warning; units are the property `unit_string`.
 
     Raises ValueError for a damaged file and for channels of a group without a time in common,
     ImportError without npTDMS.
@@ -37,18 +40,29 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
             with open(path, "rb") as opened:  # by name, an old .tdms_index of it would be read
                 file = nptdms.TdmsFile.read(opened)
             groups = {group.name: _channels(group) for group in file.groups()}
+            samples = {
+                name: {label: channel[:] for label, channel in channels.items()}
+                for name, channels in groups.items()
+            }
     except Exception as error:  # npTDMS raises many types for damaged files
         raise damaged_file_error(path, error) from None
     broken = ["the recording breaks off within a segment"] if _is_truncated(file) else []
     runs = {}
     for name, channels in groups.items():
-        numeric = {label: channel[:] for label, channel in channels.items()}
-        numeric = {a: b for a, b in numeric.items() if np.issubdtype(b.dtype, np.number)}
+        numeric = {a: b for a, b in samples[name].items() if np.issubdtype(b.dtype, np.number)}
         if numeric:
             source = f"{path}, group {name!r}"
             units = {a: text_attribute(channels[a].properties.get("unit_string")) for a in numeric}
-            clocks, origin = _clocks({a: channels[a] for a in numeric})
-            runs[name] = table_of(source, numeric, units, clocks, broken, origin)
+            clocks, origin = _clocks({a: channels[a] for a in numeric}, units)
+            dates = [b for b in samples[name].values() if b.dtype.kind == "M" and b.size]
+            timed = clocks or any(is_time_name(a, units[a]) for a in numeric)
+            if timed or not dates:
+                runs[name] = table_of(source, numeric, units, clocks, broken, origin)
+                continue
+            numeric["time"], units["time"] = (dates[0] - dates[0][0]) / SECOND, "s"
+            table = table_of(source, numeric, units, None, broken)
+            start = date_of(float((dates[0][0] - EPOCH) / SECOND))
+            runs[name] = dataclasses.replace(table, start=start)
     return runs
 
 
@@ -74,7 +88,7 @@ def _is_truncated(file) -> bool:
     return bool(file.file_status.incomplete_final_segment)
 
 
-def _clocks(channels) -> tuple[dict[str, Clock] | None, float]:
+def _clocks(channels, units) -> tuple[dict[str, Clock] | None, float]:
     """Clocks of channels by their waveform properties, None if no channel has them.
 
     And the date of their zero, in s since 1970; 0 without one.
@@ -83,7 +97,7 @@ def _clocks(channels) -> tuple[dict[str, Clock] | None, float]:
     for name, channel in channels.items():
         properties = channel.properties
         starts[name] = float(properties.get("wf_start_offset", 0.0))
-        if "wf_increment" in properties and not is_time_name(name):
+        if "wf_increment" in properties and not is_time_name(name, units[name]):
             steps[name] = float(properties["wf_increment"])
             if isinstance(properties.get("wf_start_time"), np.datetime64):
                 dates[name] = properties["wf_start_time"]
@@ -91,10 +105,10 @@ def _clocks(channels) -> tuple[dict[str, Clock] | None, float]:
         return None, origin
     if len(dates) == len(steps):  # of some only, it tells nothing of the others
         first = min(dates.values())
-        origin = float((first - np.datetime64(0, "s")) / np.timedelta64(1, "s"))
+        origin = float((first - EPOCH) / SECOND)
         for name, date in dates.items():
-            starts[name] += (date - first) / np.timedelta64(1, "s")
-    names = [name for name in channels if not is_time_name(name)]
+            starts[name] += (date - first) / SECOND
+    names = [name for name in channels if not is_time_name(name, units[name])]
     return clocks_of(names, starts, steps), origin
 
 
