@@ -90,14 +90,6 @@ def critical_speed(span: Span) -> float:
     return span.frequencies[0] / span.wavenumbers[0]
 
 
-def cancellation_speed(span: Span, mode: int, order: int) -> float:
-    """The speed in m/s after which a crossing force leaves mode `mode` (from 1) at rest.
-
-    The force passes n half waves of the mode while that swings n / 2 + order times.
-    """
-    return mode**2 / (mode + 2.0 * order) * critical_speed(span)
-
-
 def influence_line(
     length: float, flexural_rigidity: float, ends: str, at: float, positions: np.ndarray
 ) -> np.ndarray:
