@@ -160,10 +160,6 @@ def assert_same(found, expected):
             assert_array_equal(a, b, err_msg=name)
 
 
-def test_dataset_restores_the_record_exactly(record):
-    assert_same(record_from_xarray(record.to_xarray()), record)
-
-
 def test_netcdf_file_restores_the_record_exactly(record, tmp_path):
     path = tmp_path / "run.nc"
     record.to_netcdf(path)

@@ -131,15 +131,6 @@ def test_peaks_over_piers_of_a_slow_force():
     assert_allclose(found.largest.max(), dense.largest.max(), rtol=1e-4)
 
 
-def test_shear_on_both_sides_of_piers():
-    """Left of a pier -P with the force there, right of it P, and at the ends P."""
-    case = replace(CONTINUOUS, {"run.sample_rate": 40.0})
-    found = jb.simulate(case).envelope("shear")
-    at_piers = np.isin(found.positions, PIERS)
-    assert_allclose(found.largest[at_piers], 3e5, rtol=2e-3)
-    assert_allclose(found.smallest[at_piers], -3e5, rtol=2e-3)
-
-
 def test_envelopes_between_samples_have_the_same_extremes():
     """At 20 m/s, from samples and between them, over a pier and in the middle span."""
     case = replace(CONTINUOUS, {"loads.0.speed": 20.0, "run.duration": 5.0})
@@ -197,62 +188,3 @@ def test_moments_over_piers_of_a_truck():
     case = replace(case, {"run.duration": 190.0, "run.sample_rate": 10.0})
     found = jb.simulate(case).envelope("moment")
     assert_allclose(found.smallest.min(), moments.min(), rtol=5e-4)
-
-
-# 40, 60, 40 m, 2 m deep, 4 m over the piers, each haunch of 12 m a parabola.
-HAUNCH = [jb.Segment(12.0, height=[2.0, 0.0, 2.0]), jb.Segment(12.0, height=[4.0, -4.0, 2.0])]
-HAUNCHED = jb.Case(
-    jb.Beam(
-        140.0,
-        width=0.2,
-        youngs_modulus=210e9,
-        density=17e3,
-        damping_ratio=0.1,
-        modes=8,
-        segments=[
-            *(jb.Segment(28.0, height=2.0), *HAUNCH, jb.Segment(36.0, height=2.0)),
-            *(*HAUNCH, jb.Segment(28.0, height=2.0)),
-        ],
-    ),
-    supports=[jb.Support(40.0), jb.Support(100.0)],
-    loads=[jb.MovingForce(force=2e6, speed=1.0)],
-    run=jb.Run(142.0, sample_rate=10.0),
-)
-
-
-def haunched_pier_moments(force: float, x: np.ndarray) -> np.ndarray:
-    """Moments (x, pier) of the haunched bridge under a force at x, by the force method.
-
-    Three hinged spans and the moments over the piers that close the angles there; integrals of
-    m m' / (E I) by the midpoint rule over 1 cm.
-    """
-    s = np.arange(0.005, 140.0, 0.01)
-    depth = 2.0 + 2.0 * np.max([1 - np.abs(s - p) / 12.0 for p in (40.0, 100.0)] + [0 * s], 0) ** 2
-    flexibility = 0.01 / (210e9 * 0.2 * depth**3 / 12)
-    edges = [0.0, 40.0, 100.0, 140.0]
-    units = [np.interp(s, edges, unit) for unit in ([0, 1, 0, 0], [0, 0, 1, 0])]
-    matrix = [[np.sum(a * b * flexibility) for b in units] for a in units]
-    moments = []
-    for y in x:
-        i = min(np.searchsorted(edges, y, side="right") - 1, 2)
-        left, right = edges[i], edges[i + 1]
-        peak = force * (y - left) * (right - y) / (right - left)
-        own = np.interp(s, [left, y, right], [0.0, peak, 0.0]) if left < y < right else 0 * s
-        moments.append(np.linalg.solve(matrix, [-np.sum(a * own * flexibility) for a in units]))
-    return np.array(moments)
-
-
-def test_moments_over_piers_of_a_haunched_bridge():
-    """A heavy slow force, by the force method; sections at all piers and changes are positions."""
-    moments = haunched_pier_moments(2e6, np.linspace(0.0, 140.0, 561))
-    record = jb.simulate(HAUNCHED)
-    found = record.envelope("moment")
-    at_piers = np.isin(found.positions, [40.0, 100.0])
-    assert at_piers.sum() == 2
-    assert_allclose(found.smallest[at_piers], moments.min(axis=0), rtol=1e-3)
-    assert_allclose(found.smallest.min(), moments.min(), rtol=1e-3)
-    assert_allclose(np.min(record.bending_moment([100.0])), moments[:, 1].min(), rtol=1e-3)
-    grid = record.envelope("moment", np.linspace(0.0, 140.0, 101))
-    assert grid.smallest.min() > 0.985 * found.smallest.min()
-    static = [float(jb.statics.static_peak(HAUNCHED, x, quantity="moment")) for x in (40.0, 100.0)]
-    assert_allclose(static, np.abs(moments).max(axis=0), rtol=1e-4)

@@ -3,17 +3,12 @@
 import dataclasses
 import json
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.case import replace
-from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.integration_plan import integration_plan
-from tests.differences import central
 from tests.modules import ROOT
 
 REFERENCES = json.loads((ROOT / "tests" / "data" / "sections.json").read_text())["cases"]
@@ -185,19 +180,6 @@ def standing(x: float, beam: jb.Beam, **parts) -> jb.Record:
     return jb.simulate(jb.Case(beam, loads=[load], run=jb.Run(8.0), **parts), np.array([7.0, 8.0]))
 
 
-@pytest.mark.parametrize("a", [0.25, 0.5, 0.7])
-def test_a_force_standing_on_one_span(a):
-    """M = P b x / L up to the load, V = P b / L and -P a / L: exact with three modes."""
-    record = standing(a, jb.Beam(length=1.0, **UNIT))
-    x = np.array([0.0, 0.1, 0.25, 0.5, 0.7, 0.9, 1.0])
-    moments = 2 * np.where(x < a, (1 - a) * x, a * (1 - x))
-    assert_allclose(record.bending_moment(x)[-1], moments, rtol=0, atol=1e-9)
-    left, right = record.shear_force(x, "left")[-1], record.shear_force(x)[-1]
-    assert_allclose(left, np.where(x <= a, 2 * (1 - a), -2 * a), rtol=0, atol=1e-8)
-    assert_allclose(right, np.where(x < a, 2 * (1 - a), -2 * a), rtol=0, atol=1e-8)
-    assert_allclose(record.reactions[-1], [2 * (1 - a), 2 * a], rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize("a", [0.3, 1.0, 1.6])
 def test_a_force_standing_on_two_spans(a):
     """Clapeyron's three moments: M_B = -P a (L^2 - a^2) / (4 L^2) for a force on the first span."""
@@ -357,30 +339,3 @@ def test_strain_under_a_slow_axle_is_right_with_three_modes(modes):
     modal = np.asarray(record.coordinates)[middle] @ np.asarray(record.modes.shapes(15.0, 2))
     assert modal * 3e10 < (0.91 if modes == 3 else 0.94) * moment
     assert_allclose(record.extremes.largest[1], moment, rtol=1e-3)
-
-
-# Derivatives
-
-
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
-def test_gradients_of_the_largest_moment(derivative):
-    """By mass and speed, of the largest sample, against differences."""
-    case = jb.Case(
-        jb.Beam(length=1.0, damping_ratio=0.03, modes=3, **UNIT),
-        loads=[jb.MovingMass(mass=0.25, speed=0.8)],
-        run=jb.Run(1.25, gravity=4.0),
-    )
-    times = np.linspace(0.0, 1.2, 37)
-    plan = integration_plan(case, times, tolerance=1e-9)
-
-    def largest(values):
-        changed = replace(case, dict(zip(("loads.0.mass", "loads.0.speed"), values, strict=True)))
-        record = jb.simulate(changed, times, plan)
-        reaction = record.reactions[20, 1]
-        moment, shear = record.bending_moment(0.47), record.shear_force(0.3)
-        return xp.stack([xp.max(moment), shear[5], reaction])
-
-    expected = central(largest, [0.25, 0.8], 1e-3)
-    found = jax.jit(derivative(largest))(jnp.array([0.25, 0.8]))
-    assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-    assert np.all(np.abs(expected[0]) > 1e-2)

@@ -1,8 +1,7 @@
-"""Axles that a track spreads: against axles split by hand, closed forms, derivatives, refusals."""
+"""Axles that a track spreads: against axles split by hand, closed forms, refusals."""
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 import scipy
@@ -17,7 +16,6 @@ from jaxbeam.analysis.assessment.checks import (
 from jaxbeam.case.track import SLEEPER_FRACTIONS
 from jaxbeam.library import published
 from jaxbeam.numerics.polynomials import gauss_nodes, gauss_weights
-from tests.differences import central
 
 SLEEPERS = jb.Track(spread="3 sleepers")
 UNEVEN = jb.Track(spread_offsets=[-0.9, 0.2, 1.1], spread_shares=[2.0, 5.0, 3.0])
@@ -258,29 +256,6 @@ def test_assessment_with_a_spread():
     assert values[1] < values[0]
     assert plain.inputs["spread of axles"] == "none"
     assert "3 sleepers" in spread.inputs["spread of axles"]
-
-
-@pytest.mark.parametrize(
-    ("track", "address"),
-    [
-        (SLEEPERS, "track.sleeper_spacing"),
-        (jb.Track(spread_length=2.4), "track.spread_length"),
-        (UNEVEN, "track.spread_offsets.2"),
-        (UNEVEN, "beam.length"),
-        (SLEEPERS, "loads.0.speed"),
-    ],
-)
-def test_derivatives(track, address):
-    case = dataclasses.replace(case_of(track=track), sensors=[jb.Sensor(5.0), SENSORS[2]])
-    for place in (0, 1):
-
-        def peak(value, place=place):
-            return jb.simulate(jb.replace(case, {address: value})).smallest[place]
-
-        at = float(np.asarray(jb.addresses(case)[address]))
-        found = float(jax.grad(peak)(at))
-        expected = central(lambda x: peak(x[0]), [at], 1e-4 * at)
-        assert found == pytest.approx(float(expected[0]), rel=2e-4)
 
 
 def test_shares_of_the_rule():
