@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +17,6 @@ from jaxbeam.case.case import addresses, replace
 from jaxbeam.case.validation import check_case
 from jaxbeam.fmi import BeamSteps
 from jaxbeam.model.frequency_responses import frequency_response
-from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.state_space import poles
-from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
@@ -80,73 +75,6 @@ def test_command_limits_of_other_actuators():
         assert actuator.command_limits() is None
         assert actuator.command_rate_limit() is None
     assert jb.Patch(0.1, 0.2, 1e-3).command_rate_limit() is None
-
-
-@pytest.mark.parametrize("back_emf", [None, 4.2, 3.0])
-def test_power_balance_of_a_coil(back_emf):
-    """u I = R I^2 + damping + d/dt of the stored energy for any state, if K_v = K_f."""
-    shaker = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, back_emf, 0.02, 9700.0, 0.55)
-    case = jb.Case(jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03), actuators=[shaker])
-    model = eqx.filter_jit(modal_model)(case, mesh_layout(case))
-    matrix = np.asarray(model.state_matrix[0])
-    state = np.random.default_rng(1).standard_normal(7)
-    volts, current, rates = 3.0, state[6], state[1:6:2]
-    change = matrix @ state + np.asarray(model.command_matrix)[:, 0] * volts
-    displacements, stiffness = state[0:6:2], np.asarray(model.stiffness())
-    stored_power = (
-        rates @ change[1:6:2] + displacements @ stiffness @ rates + 5e-5 * current * change[6]
-    )
-    dissipated = -rates @ matrix[1:6:2, 1:6:2] @ rates + 0.82 * current**2
-    assert dissipated > 0
-    mismatch_power = ((4.2 - (4.2 if back_emf is None else back_emf)) * current) * float(
-        model.displacement_map[0] @ rates
-    )
-    assert_allclose(volts * current + mismatch_power, stored_power + dissipated, rtol=1e-10)
-
-
-def test_crossing_mass_on_a_beam_with_a_shorted_coil():
-    """Against the coupled electromechanical equations of sine modes, integrated by scipy."""
-    beam = {"length": 0.6, "rigidity": 11.68, "density": 0.535, "ratio": 0.03}
-    case = jb.Case(
-        jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03),
-        actuators=[V4],
-        sensors=[jb.Sensor(0.3)],
-        loads=[jb.MovingMass(0.5, 2.0)],
-        run=jb.Run(duration=0.5, sample_rate=200.0),
-    )
-    wave = np.arange(1, 4) * np.pi / beam["length"]
-    omega = wave**2 * np.sqrt(beam["rigidity"] / beam["density"])
-    size = np.sqrt(2 / (beam["density"] * beam["length"]))
-    shape_at_coil = size * np.sin(wave * 0.5)
-
-    def rates(t, y, on):
-        q, u, current = y[:3], y[3:6], y[6]
-        mass = np.eye(3) + 0.02 * np.outer(shape_at_coil, shape_at_coil)
-        force = -2 * 0.03 * omega * u - omega**2 * q
-        force += shape_at_coil * (
-            4.2 * current - 9700 * shape_at_coil @ q - 0.55 * shape_at_coil @ u
-        )
-        if on:
-            x, speed = 2.0 * t, 2.0
-            shape = size * np.sin(wave * x)
-            slope, curvature = size * wave * np.cos(wave * x), -size * wave**2 * np.sin(wave * x)
-            mass += 0.5 * np.outer(shape, shape)
-            force -= shape * 0.5 * (9.81 + 2 * speed * slope @ u + speed**2 * curvature @ q)
-        coil = (-0.82 * current - 4.2 * shape_at_coil @ u) / 5e-5
-        return np.concatenate([u, np.linalg.solve(mass, force), [coil]])
-
-    options = {"method": "Radau", "rtol": 1e-9, "atol": 1e-12}
-    record, history = jb.simulate(case), []
-    times = np.asarray(record.times)
-    start = np.zeros(7)
-    for on, first, last in ((True, 0.0, 0.3), (False, 0.3, 0.5)):
-        here = times[(times >= first) & ((times < last) if on else (times <= last))]
-        found = solve_ivp(rates, (first, last), start, t_eval=[*here, last] if on else here,
-                          args=(on,), **options)  # fmt: skip
-        history.append(found.y[:3, : here.size].T)
-        start = found.y[:, -1]
-    expected = np.concatenate(history) @ (size * np.sin(wave * 0.3))
-    assert_allclose(record.deflection[:, 0], expected, atol=2e-6 * np.abs(expected).max())
 
 
 def test_static_gains():
@@ -340,19 +268,6 @@ def test_where_limits_of_the_voltage_are_refused():
     assert jb.modes(free).frequencies.size == 2
 
 
-def test_poles_of_the_loop_with_the_coil_at_rest():
-    """L p^2 + (R + P) p + Q = 0; from a bandwidth -b and the cancelled pole of the coil, -R / L."""
-    given = shaker(jb.actuators.CurrentLoop(proportional=3.0, integral=700.0)).attachment()
-    found = np.linalg.eigvals(given.state_matrix)
-    assert_allclose(np.sort(found), np.sort(np.roots([L, R + 3.0, 700.0])), rtol=1e-12)
-    for loop in (
-        jb.actuators.CurrentLoop(bandwidth=900.0),
-        jb.actuators.ForceLoop(bandwidth=900.0),
-    ):
-        found = np.linalg.eigvals(shaker(loop).attachment().state_matrix)
-        assert_allclose(np.sort(found), [-900.0, -R / L], rtol=1e-10)
-
-
 @pytest.mark.parametrize(
     ("loop", "gain", "stiffness"),
     [
@@ -373,48 +288,6 @@ def test_steady_force(loop, gain, stiffness):
     assert_allclose(attachment.stiffness, stiffness, rtol=1e-12, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("loop_class", "suspension", "factor"),
-    [
-        (jb.actuators.CurrentLoop, (jb.SpringDamper(PLACE, STIFFNESS, DAMPING),), KF),
-        (jb.actuators.ForceLoop, (), 1.0),
-    ],
-)
-def test_ideal_source_in_the_limit_of_its_bandwidth(loop_class, suspension, factor):
-    """The distance of the receptances falls as 1 / bandwidth: no back-EMF and no lag is left."""
-    frequencies, pair = np.array([0.0, 4.0, 21.0, 90.0]), [("actuators.0", "deflection@0.3")]
-
-    def receptance(*actuators):
-        case = jb.Case(BEAM, actuators=actuators)
-        return np.asarray(frequency_response(case, frequencies, pair).values)[:, 0]
-
-    expected = factor * receptance(jb.PointForce(PLACE), *suspension)
-    distances = [
-        np.abs(receptance(shaker(loop_class(bandwidth=b), mass=0.0)) / expected - 1).max()
-        for b in (1e6, 1e7)
-    ]
-    assert distances[1] < 1e-3
-    assert_allclose(distances[0] / distances[1], 10.0, rtol=0.02)
-
-
-def test_damping_by_the_back_emf_vanishes_under_current_drive():
-    """A shorted coil adds K_f K_v / R to the damper; a current source adds nothing."""
-
-    def ratio(actuator):
-        found = poles(jb.Case(BEAM, actuators=[actuator], sensors=[jb.Sensor(0.3)]))
-        first = found[np.abs(found.imag) > 1][np.argmin(np.abs(found[np.abs(found.imag) > 1]))]
-        return -first.real / abs(first)
-
-    light = {"mass": 0.0, "stiffness": 0.0, "damping": 0.0}
-    damper = jb.SpringDamper(PLACE, damping=KF * KV / R)
-    quick = dataclasses.replace(shaker(**light), inductance=np.array(1e-6))
-    assert_allclose(ratio(quick), ratio(damper), rtol=1e-3)
-    assert ratio(quick) > 0.2
-    assert_allclose(
-        ratio(shaker(jb.actuators.CurrentLoop(bandwidth=1e6), **light)), 0.03, rtol=1e-3
-    )
-
-
 @pytest.mark.parametrize("name", LOOPS)
 def test_voltage_over_current_is_the_impedance(name):
     """Eq. (2.26) of the thesis holds whatever sets the voltage, and (2.33) for the forces."""
@@ -432,23 +305,6 @@ def test_voltage_over_current_is_the_impedance(name):
     assert_allclose(found[:, 1] / found[:, 0], impedance, rtol=1e-9)
     assert_allclose(found[:, 2], KF * found[:, 0], rtol=1e-12)
     assert_allclose(found[:, 3] / found[:, 2], 1 / (1 + beam * mechanical), rtol=1e-9)
-
-
-def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
-    names = ("proportional", "integral", "sensor_bandwidth")
-
-    def numbers(values):
-        changed = dict(zip(names, values[:3], strict=True))
-        coil = dict(zip(("inductance", "mass", "stiffness"), values[3:], strict=True))
-        actuator = dataclasses.replace(
-            shaker(), inner_loop=jb.actuators.ForceLoop(**changed), **coil
-        )
-        found = jax.tree.leaves(actuator.attachment())
-        return xp.concatenate([xp.ravel(leaf) for leaf in found]) / 1e3
-
-    point = np.array([0.4, 9.0, 20.0, 0.5, 0.3, 9.0])
-    found = jax.jit(jax.jacfwd(numbers))(jax.numpy.asarray(point))
-    assert_allclose(found, central(numbers, point), rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize(

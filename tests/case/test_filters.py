@@ -17,7 +17,6 @@ from jaxbeam.case.sensors import (
     steady_filter_state,
 )
 from jaxbeam.numerics.stages import c2d
-from tests.differences import central
 
 ORDERS = [1, 2, 3, 5, 10]
 PERIOD = 1e-3
@@ -134,22 +133,3 @@ def test_discretisation_with_polynomial_holds_is_exact(order):
     middle = np.tensordot(cubic * 0.5 ** np.arange(4), half_inputs[..., 0], axes=1)
     expected = half_transition @ middle + np.tensordot(second, half_inputs[..., 0], axes=1)
     assert_allclose(np.tensordot(cubic, inputs[..., 0], axes=1), expected, rtol=1e-11)
-
-
-@pytest.mark.parametrize("order", [3, 10])
-def test_derivatives_with_respect_to_the_cutoff(order):
-    def digital(cutoff):
-        rows = second_order_sections(Filter(cutoff[0], order), PERIOD)
-        return filter_history(rows, steady_filter_state(rows, 0.3), jnp.asarray(SIGNAL[:80, 0]))
-
-    def continuous(cutoff):
-        matrix, column, _, _ = analogue_state_space(Filter(cutoff[0], order))
-        return jnp.concatenate([part.ravel() for part in c2d(matrix, column[:, None], 0.01)])
-
-    point = jnp.array([60.0])
-    for function in (digital, continuous):
-        expected = central(function, point, step=0.05)
-        size = np.max(np.abs(expected))
-        for derivative in (jax.jacfwd, jax.jacrev):
-            found = jax.jit(derivative(function))(point)
-            assert_allclose(found, expected, rtol=0, atol=1e-7 * size)

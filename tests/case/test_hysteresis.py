@@ -3,7 +3,6 @@
 import dataclasses
 import re
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -14,13 +13,10 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import held_command_limits
 from jaxbeam.case.validation import check_case
-from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.commands import acting_ranges, command_operator, with_exact_compensation
 from jaxbeam.simulation.stored_record import record_from_xarray
-from tests.differences import central
 
 OPERATOR = jb.actuators.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.7, 0.15, 0.1, 0.15])
-OTHER = jb.actuators.Hysteresis([0.0, 0.8, 2.0], [0.75, 0.2, 0.15])
 COMMANDS = arrays(float, st.integers(2, 12), elements=st.floats(-6, 6, allow_subnormal=False))
 
 
@@ -68,21 +64,6 @@ def test_properties_of_the_operator(commands):
     assert_allclose(inverse.outputs(outputs), commands, atol=1e-12)
 
 
-def test_compensated_loop_is_that_of_the_linear_patch():
-    linear = jb.simulate(patch_case())
-    hysteretic, rough, exact = (
-        jb.simulate(patch_case(hysteresis=OPERATOR, compensation=compensation))
-        for compensation in (None, OTHER, OPERATOR)
-    )
-    size = np.max(np.abs(linear.deflection))
-    errors = [np.max(np.abs(r.deflection - linear.deflection)) for r in (hysteretic, rough, exact)]
-    assert errors[0] > 0.02 * size and errors[1] < errors[0] / 2 and errors[2] < 1e-11 * size
-    assert_allclose(exact.acting_command, linear.command, atol=1e-9)
-    # Commands that were sent are within the limits, and act through the operator.
-    acting = OPERATOR.outputs(np.asarray(hysteretic.command)[:, 0])
-    assert_allclose(np.asarray(hysteretic.acting_command)[:, 0], acting, atol=1e-12)
-
-
 def test_limits_are_those_of_the_commands_that_are_sent():
     """At the limits the law knows what acts, so that the inverse follows on leaving them."""
     record = jb.simulate(patch_case(limits=[-1.0, 2.0], hysteresis=OPERATOR, compensation=OPERATOR))
@@ -99,14 +80,6 @@ def test_commands_of_the_bound_act_where_the_hysteresis_is_compensated():
     least = jb.bound(case, period=0.04)
     replay = dataclasses.replace(with_exact_compensation(case), controller=least.controller())
     assert_allclose(jb.simulate(replay).peak_deflection.max(), least.peak, rtol=2e-3)
-
-
-def test_derivative_by_the_weights():
-    """Of the linear way out and back: outputs of a rising command are linear in the weights."""
-    points = np.array([0.0, 2.0, 4.0])
-    change = dataclasses.replace(OPERATOR, weights=OPERATOR.weights + np.array([0, 0.1, 0, 0]))
-    expected = 0.1 * np.maximum(points - 0.5, 0.0)
-    assert_allclose(change.outputs(points) - OPERATOR.outputs(points), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -221,28 +194,6 @@ def test_range_of_what_acts_holds_under_any_command():
     assert_allclose([low[0], high[0]], [-0.775 * 1.12, 1.675 * 1.12])
     operator = command_operator(OPERATOR, CREEP, np.asarray(2.0))
     assert_allclose(acting(operator, np.full(30, 2.0))[0][-1], 1.675 * 1.12, rtol=1e-4)
-
-
-def loop(values, commands):
-    """Sum of squares of what acts under commands, with feedback of what acted before."""
-    weights, rates, gain = values[:3], values[3:5], values[5]
-    hysteresis = jb.actuators.Hysteresis(xp.asarray([0.0, 0.5, 1.5]), weights)
-    operator = command_operator(
-        hysteresis, jb.actuators.Creep(rates, xp.asarray([0.1, 0.2])), PERIOD
-    )
-    state, total, output = operator.start(1), 0.0, xp.zeros(1)
-    for command in commands:
-        state = operator.follow(state, command - gain * output)
-        output = operator.output(state)
-        total = total + output[0] ** 2
-    return total
-
-
-def test_derivatives_through_hysteresis_and_creep():
-    point = np.array([0.7, 0.2, 0.1, 20.0, 2.0, 0.3])
-    commands = 2 * np.sin(0.8 * np.arange(9.0))
-    found = jax.jit(jax.grad(lambda values: loop(values, commands)))(jax.numpy.asarray(point))
-    assert_allclose(found, central(lambda values: loop(values, commands), point), rtol=1e-8)
 
 
 @pytest.mark.parametrize(

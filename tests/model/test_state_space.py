@@ -115,20 +115,6 @@ def _direct(system, t):
     return system.at(t).D[:, len(system.case.actuators) :] @ system.weights
 
 
-def test_free_vibration_is_that_of_python_control(system, record, outputs):
-    first = np.flatnonzero(np.asarray(record.times) > 0.3)[0]
-    modal = np.stack([record.coordinates, record.rates], axis=2).reshape(-1, 6)
-    start = system.from_modal(jnp.append(modal[first], 0.0))  # the shaker is not driven
-    model = system.unloaded.to_control()
-    times = np.asarray(record.times[first:]) - float(record.times[first])
-    found = control.initial_response(model, times, np.asarray(start)).outputs.T
-    expected = outputs[first:]
-    for i in range(len(SENSORS)):
-        size = np.max(np.abs(outputs[:, i]))
-        assert_allclose(found[:, i], expected[:, i], rtol=0, atol=1e-9 * size)
-    assert_allclose(system.to_modal(start), jnp.append(modal[first], 0.0), rtol=1e-15)
-
-
 def test_frequency_response_is_that_of_the_modal_impedances():
     """Force and moment to deflection, from impedances computed here."""
     case = jb.Case(

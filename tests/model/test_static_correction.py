@@ -4,14 +4,12 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.sections import corrected_deflection
-from jaxbeam.case.case import replace
 from jaxbeam.model.deflection_lines import (
     LoadInfluence,
     influence_line,
@@ -66,18 +64,6 @@ def oracle_deflections(case: jb.Case, x, derivative: int = 0) -> np.ndarray:
 # Exact static deflection per command
 
 
-def test_patch_on_a_pinned_beam_against_closed_form():
-    """w'' = -M / E I over the patch, zero elsewhere: w = (M / E I) (two Macaulay terms)."""
-    a, b, length = 0.2, 0.35, 0.6
-    x = np.linspace(0.0, length, 13)
-    ramp = ((length - a) ** 2 - (length - b) ** 2) / 2
-    bent = np.maximum(x - a, 0) ** 2 / 2 - np.maximum(x - b, 0) ** 2 / 2
-    expected = 1e-3 / 13.211 * (ramp * x / length - bent)
-    found = static_deflection_per_command(PLAIN, x)[0]
-    assert_allclose(found, expected, rtol=1e-12, atol=1e-20)
-    assert found[6] > 0
-
-
 def test_slope_curvature_and_third_derivative_of_a_pinned_beam():
     x = np.array([0.1, 0.2, 0.3, 0.35, 0.5])
     over = np.array([0, 1, 1, 0, 0])  # at the ends of the patch, the section to the right
@@ -107,17 +93,6 @@ def test_patch_with_other_ends_and_supports(ends, supports):
     assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
-def test_residual_decreases_with_the_number_of_modes():
-    errors = []
-    for count in (4, 12, 36):
-        case = jb.Case(dataclasses.replace(PLAIN.beam, modes=count), actuators=PLAIN.actuators)
-        errors.append(float(jnp.abs(residual_actuator_gain(case, X[2:4])).max()))
-    largest = float(static_deflection_per_command(PLAIN, 0.3)[0])
-    assert errors[0] < 0.05 * largest
-    assert errors[1] < errors[0] / 5
-    assert errors[2] < errors[1] / 5
-
-
 # Modes plus residual
 
 
@@ -143,20 +118,6 @@ def test_modes_plus_residual_are_exact(model, derivative):
     exact = influence_line(GENERAL, X, y, derivative)
     found = modal + residual_flexibility(GENERAL, X, y, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
-
-
-def test_derivatives_of_residuals():
-    layout, scale = mesh_layout(PLAIN), np.array([1.0, 100.0])
-
-    def residual(values):
-        names = ("actuators.0.start", "beam.flexural_rigidity")
-        changed = replace(PLAIN, dict(zip(names, values * scale, strict=True)))
-        return residual_actuator_gain(changed, X[3:5], 2, layout)[0]
-
-    point = np.array([0.2, 0.13])
-    found = jax.jacobian(residual)(jnp.asarray(point))
-    expected = central(residual, point, 1e-3)
-    assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
 
 
 # Section forces
@@ -189,46 +150,6 @@ def test_moment_of_a_patch_on_a_clamped_beam():
     assert_allclose(
         shear_force(case, x, static_deflection_per_command(case, x, 3)[0]), q, rtol=1e-10
     )
-
-
-@pytest.mark.parametrize("x", [0.0, 0.12, 0.6])
-def test_moments_and_shear_of_a_clamped_beam(x):
-    """P at a quarter: -P a b^2 / L^2 and -P a^2 b / L^2 at the ends, V = P b^2 (3 a + b) / L^3."""
-    case = jb.Case(dataclasses.replace(PLAIN.beam, ends="clamped-clamped"))
-    left, right = -0.15 * 0.45**2 / 0.36, -(0.15**2) * 0.45 / 0.36
-    shear = 0.45**2 * (3 * 0.15 + 0.45) / 0.216
-    moments = {0.0: left, 0.12: left + shear * 0.12, 0.6: right}
-    found = bending_moment(case, x, influence_line(case, x, 0.15, 2))
-    assert_allclose(found, moments[x], rtol=1e-11)
-    forces = {0.0: shear, 0.12: shear, 0.6: shear - 1}
-    assert_allclose(shear_force(case, x, influence_line(case, x, 0.15, 3)), forces[x], rtol=1e-11)
-
-
-def test_moment_under_a_slow_load_and_a_patch():
-    """Three modes and the correction: P a b / L, within the dynamics of a slow crossing."""
-    case = jb.Case(
-        jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.1),
-        actuators=[jb.Patch(0.25, 0.35, 1e-3)],
-        loads=[jb.MovingForce(force=5.0, speed=0.05)],
-        run=jb.Run(duration=12.0, sample_rate=10.0),
-    )
-    record = jb.simulate(case)
-    x = np.array([0.15, 0.3, 0.41])
-    found = bending_moment(case, x, corrected_deflection(record, x, 2))
-    at = 0.05 * np.asarray(record.times)[1:-1, None]
-    expected = 5.0 * np.minimum(at, x) * (0.6 - np.maximum(at, x)) / 0.6
-    assert_allclose(found[1:-1], expected, atol=2e-3)
-    curvature = np.tensordot(record.coordinates, record.modes.shapes(x, 2), axes=[1, -1])
-    modal = bending_moment(case, x, curvature)
-    assert np.abs(modal[1:-1] - expected).max() > 0.05
-    # The correction includes the commands of a record.
-    controlled = dataclasses.replace(case, controller=jb.Prescribed(offsets=[1.0]))
-    steady = dataclasses.replace(
-        record, case=controlled, command=jnp.full((record.times.size, 1), 100.0)
-    )
-    residual = residual_actuator_gain(case, x, 2)[0] * 100.0
-    difference = corrected_deflection(steady, x, 2) - corrected_deflection(record, x, 2)
-    assert_allclose(difference, np.tile(residual, (121, 1)), atol=1e-15)
 
 
 def test_wheels_on_the_ground_do_not_bend_the_beam():

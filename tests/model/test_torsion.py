@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -244,26 +243,6 @@ def test_peaks_of_sweeps_are_those_of_runs_and_of_a_train_in_closed_form():
         for i, name in enumerate(QUANTITIES):
             peak = max(record.largest[i], -record.smallest[i])
             assert float(found[f"peak_{name}"][i]) == pytest.approx(float(peak), rel=1e-5)
-
-
-def test_derivatives_by_numbers_of_torsion():
-    load = jb.MovingMass(mass=2e4, speed=40.0, eccentricity=2.0)
-    case = box([load], modes=4, run=jb.Run(0.4, sample_rate=50.0))
-    addresses = ("loads.0.eccentricity", "beam.torsional_rigidity", "beam.polar_inertia")
-
-    def last_torque(*values):
-        changed = jb.replace(case, dict(zip(addresses, values, strict=True)))
-        return jb.simulate(changed).at(12.0, "torque")[-1] / 1e4
-
-    values = [2.0, GJ, INERTIA]
-    derivatives = jax.grad(last_torque, argnums=(0, 1, 2))(*values)
-    for i, value in enumerate(values):
-        step = 1e-5 * value
-        sides = [
-            last_torque(*(v + s * (i == j) for j, v in enumerate(values))) for s in (step, -step)
-        ]
-        difference = (sides[0] - sides[1]) / (2 * step)
-        assert derivatives[i] == pytest.approx(float(difference), rel=1e-5)
 
 
 def test_energy_of_an_undamped_box_is_the_work_of_the_force():

@@ -16,9 +16,7 @@ from jaxbeam.case.loads.vehicle_parts import (
     VehicleSpring,
 )
 from jaxbeam.case.loads.vehicles import (
-    Oscillator,
     PlanarVehicle,
-    QuarterCar,
     check_vehicle,
     load_vehicle,
 )
@@ -49,14 +47,6 @@ def test_matrices_are_those_of_the_reference(name):
     np.testing.assert_allclose(
         vehicle.natural_frequencies(), expected["frequencies_on_rigid_track_Hz"], rtol=4e-7
     )
-
-
-@pytest.mark.parametrize("name", LOADS)
-def test_static_loads_are_the_weight_and_balance_about_the_first_axle(name):
-    vehicle = LOADS[name].vehicle(GRAVITY)
-    heights = [not one.endswith("pitch") for one in vehicle.names]
-    weight = GRAVITY * (np.sum(vehicle.mass[heights][:, heights]) + np.sum(vehicle.wheel_masses))
-    assert np.sum(vehicle.static_loads) == pytest.approx(weight, rel=1e-13)
 
 
 @pytest.mark.parametrize("name", LOADS)
@@ -113,20 +103,6 @@ def test_gradients_by_every_number_match_differences(name):
     assert np.all(np.any(exact != 0, axis=0))
 
 
-def test_stiff_suspension_moves_with_the_axle():
-    """Two masses on one another become one: f = sqrt(k_t/(m_b + m_a))/(2 pi)."""
-    car = QuarterCar(9000.0, 1000.0, 1e12, 0.0, 2e6, speed=1.0)
-    frequency = car.vehicle(GRAVITY).natural_frequencies()[0]
-    assert frequency == pytest.approx(np.sqrt(2e6 / 1e4) / (2 * np.pi), rel=2e-6)
-
-
-def test_quarter_car_on_a_rigid_tyre_is_an_oscillator():
-    car = QuarterCar(9000.0, 1.0, 1e6, 2e4, 1e12, speed=1.0)
-    sprung = Oscillator(9000.0, 1e6, 2e4, speed=1.0)
-    first, second = car.vehicle(GRAVITY), sprung.vehicle(GRAVITY)
-    assert first.natural_frequencies()[0] == pytest.approx(second.natural_frequencies()[0], 1e-6)
-
-
 # General planar vehicles: closed forms, hinges and stiff springs, statics, bad descriptions.
 
 
@@ -173,17 +149,6 @@ def test_body_on_two_tyres_has_the_frequencies_of_the_closed_form():
     assert model.names == ("cart", "cart pitch")
 
 
-def test_lever_gives_the_static_loads_of_a_body_on_two_axles():
-    """Moments about an axle: P_2 = m g (x_1 - x_c)/(x_1 - x_2), plus the axles' own weight."""
-    vehicle = PlanarVehicle(
-        bodies=[VehicleBody("body", 9000.0, 20000.0, 0.7)],
-        axles=[axle("body", 3), axle("body", -1)],
-    )
-    weight = 9000 * GRAVITY
-    expected = [weight * 1.7 / 4 + 500 * GRAVITY, weight * 2.3 / 4 + 500 * GRAVITY]
-    np.testing.assert_allclose(vehicle.model(GRAVITY).static_loads, expected, rtol=1e-12)
-
-
 def test_hinges_are_the_limit_of_stiff_springs():
     check_vehicle(ROAD_TRAIN)
     hinged = ROAD_TRAIN.model(GRAVITY)
@@ -216,18 +181,6 @@ def test_order_and_origin_do_not_matter():
     np.testing.assert_allclose(one.static_loads, other.static_loads, rtol=1e-9)
     np.testing.assert_allclose(one.natural_frequencies(), other.natural_frequencies(), rtol=1e-9)
     assert np.sum(one.static_loads) == pytest.approx((25900 + 1500) * GRAVITY, rel=1e-12)
-
-
-def test_hinge_carries_the_trailer_on_the_tractor():
-    """Moments about the hinge: an axle at -10 m carries 6/8 of a trailer with its mass at -8 m."""
-    vehicle = dataclasses.replace(
-        ROAD_TRAIN,
-        bodies=[TRACTOR, TRAILER],
-        hinges=ROAD_TRAIN.hinges[:1],
-        axles=ROAD_TRAIN.axles[:3],
-    )
-    loads = vehicle.model(GRAVITY).static_loads
-    assert loads[2] == pytest.approx((20000 * 6 / 8 + 500) * GRAVITY, rel=1e-9)
 
 
 def test_rotational_spring_and_damper_act_between_pitches():

@@ -15,13 +15,11 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.library.published import line_loads
 from jaxbeam.model.load_set import load_set
-from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
 BEAM = jb.Beam(
     length=30.0, flexural_rigidity=2.87e9, mass_per_length=1500.0, damping_ratio=0.005, modes=2
 )
-FREQUENCY = np.pi / 2 / 30.0**2 * np.sqrt(2.87e9 / 1500.0)  # Hz
 
 
 def case_of(*loads, duration=25.0) -> jb.Case:
@@ -74,33 +72,6 @@ def test_contact_time_of_a_jogger():
     assert_allclose(contact_time(np.array(2.5)), 0.2751, atol=1e-4)  # 1.8 x 2.5^-2.05
 
 
-def test_a_pedestrian_on_the_spot_is_that_of_scipy():
-    """In resonance with the first mode, one step a period."""
-    load = jb.Pedestrian(pace=FREQUENCY, position=12.0, step_time=0.1)
-    record = jb.simulate(case_of(load, duration=8.0))
-    n, times = np.arange(1, 3), np.asarray(record.times)
-    frequencies = (n * np.pi / 30.0) ** 2 * np.sqrt(2.87e9 / 1500.0)
-    shape = np.sin(n * np.pi * 12.0 / 30.0) * 2 / (1500.0 * 30.0)
-    factors = walking_factors(np.array(FREQUENCY))
-
-    def rates(t, y):
-        angles = 2 * np.pi * FREQUENCY * np.arange(1, 5) * (t - 0.1)
-        force = 700.0 * (1 + factors @ np.sin(angles))
-        q, u = y[:2], y[2:]
-        return np.append(u, -force * shape - frequencies**2 * q - 0.01 * frequencies * u)
-
-    solution = solve_ivp(rates, (0, 8.0), np.zeros(4), t_eval=times, rtol=1e-10, atol=1e-14)
-    expected = np.sin(n * np.pi / 2) @ solution.y[:2]
-    size = np.max(np.abs(expected))
-    assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * size)
-    # Near the closed form of resonance at rest: F / (2 k zeta) (1 - exp(-zeta w t)).
-    modal = 700.0 * factors[0] * shape[0] / (2 * 0.005 * frequencies[0] ** 2)
-    grown = modal * (1 - np.exp(-0.005 * frequencies[0] * 8.0))
-    static = 700.0 * shape[0] / frequencies[0] ** 2
-    last = np.asarray(record.deflection)[times > 7.0, 0] + static
-    assert_allclose(np.max(np.abs(last)), grown, rtol=0.1)
-
-
 def test_a_crowd_is_its_pedestrians():
     crowd = jb.Crowd(
         people=5, length=40.0, pace=1.9, pace_deviation=0.1, speed=1.4, seed=3, entry_time=1.0
@@ -120,24 +91,6 @@ def test_a_crowd_is_its_pedestrians():
     assert len({w.pace.item() for w in walkers}) == 5
     other = load_set(case_of(dataclasses.replace(crowd, seed=4)))
     assert not np.allclose(other.behind[0], loads.behind[0])
-
-
-def test_in_case_files():
-    loads = [
-        {"kind": "pedestrian", "pace": 2.0, "speed": 1.5, "factors": [0.4, 0.1], "phases": [0, 1]},
-        {
-            "kind": "crowd",
-            "people": 3,
-            "length": 10.0,
-            "pace": 2.5,
-            "activity": "jogging",
-            "speed": 3.0,
-        },
-    ]
-    beam = {"length": 30.0, "flexural_rigidity": 2.87e9, "mass_per_length": 1500.0}
-    case = case_from_dict({"beam": beam, "loads": loads})
-    check_case(case)
-    assert isinstance(case.loads[1], jb.Crowd)
 
 
 @pytest.mark.parametrize(
@@ -392,21 +345,6 @@ def test_response_is_that_of_scipy(place):
     assert_allclose(record.deflection[:, 0], midspan, atol=1e-9 * np.abs(midspan).max())
     on_beam = times < leaves
     assert_allclose(record.contact_force[on_beam, 0], force(times[on_beam]), rtol=1e-12)
-
-
-def test_sweeps_and_gradients_reach_its_numbers():
-    case, address = case_with(speed=np.asarray(SPEED)), "loads.0.amplitudes.0"
-    swept = jb.sweep(case, {address: [0.5, 1.0]}, progress=False).peak_deflection.values[:, 0]
-    records = [jb.simulate(jb.replace(case, {address: a})) for a in (0.5, 1.0)]
-    assert_allclose(swept, [float(record.peak_deflection[0]) for record in records], rtol=1e-7)
-    plan = integration_plan(case)
-
-    def last(amplitude):
-        changed = jb.replace(case, {address: amplitude.reshape(())})
-        return jb.simulate(changed, plan=plan).deflection[-1, 0]
-
-    point = np.array([0.7])
-    assert_allclose(jax.jit(jax.grad(last))(point), central(last, point), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -171,20 +171,6 @@ def test_table_is_the_spline_with_level_ends():
     assert_allclose([height, slope, curvature], [0.5, 0.75, 0.0])  # level at both ends
 
 
-def test_a_long_table_converges_to_the_surface():
-    """At most 5/384 h^4 times the largest fourth derivative (Hall and Meyer, 1976) is missing."""
-
-    def error(count):
-        points = np.linspace(0.0, 6.0, count)  # level at both ends
-        table = jb.profiles.TableProfile(points, np.cos(np.pi * points))
-        x = np.linspace(0.0, 6.0, 4001)
-        return np.abs(table.heights(x)[0] - np.cos(np.pi * x)).max()
-
-    for count in (101, 201, 2001):
-        assert error(count) < 5 / 384 * (6 / (count - 1)) ** 4 * np.pi**4
-    assert 14 < error(101) / error(201) < 18
-
-
 NUMBERS = [
     (name, field)
     for name, profile in PROFILES.items()
@@ -407,14 +393,3 @@ def test_sums_at_close_positions_are_interpolated(shape):
     for found, part in zip(sum_of_cosines(x, n, amplitudes, phases), parts, strict=True):
         expected = part @ amplitudes
         assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-
-
-def test_profiles_are_batched():
-    """Over the roughness of a road, as a sweep does."""
-    profile, x = jb.profiles.ISO8608Profile("A", 5), np.linspace(0.0, 10.0, 7)
-
-    def heights(scale):
-        return eqx.tree_at(lambda p: p.scale, profile, scale).heights(x)[0]
-
-    batched = jax.jit(jax.vmap(heights))(np.array([1.0, 2.0]))
-    assert_allclose(batched, np.outer([1.0, 2.0], profile.heights(x)[0]), rtol=1e-12, atol=1e-15)

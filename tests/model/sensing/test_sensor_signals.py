@@ -33,7 +33,6 @@ from jaxbeam.model.sensor_signals import (
     to_reading,
 )
 from jaxbeam.model.static_correction import Motion
-from tests.differences import central
 
 TIMES = jnp.arange(201) / 1000.0
 OMEGA = 2 * np.pi * np.array([3.0, 8.0])
@@ -147,29 +146,6 @@ def test_unsuitable_times_are_refused():
     fast = Sensor(0.3, sampling_period=1e-4, filter=Filter(20.0, 3))
     with pytest.raises(ValueError, match="a reading every 0.0001 s, but .* 0.001 s apart"):
         sampled_readings(fast, TIMES, VALUES, RATES)
-
-
-@pytest.mark.parametrize("realisation", ["digital", "analogue"])
-def test_derivatives_of_readings(realisation):
-    """By offset, cutoff and delay, through sampling and filter, against differences."""
-
-    def readings(parameters):
-        offset, cutoff, delay = parameters
-        sensor = Sensor(
-            0.3,
-            offset=offset,
-            filter=Filter(20 * cutoff, 4, realisation=realisation),
-            sampling_period=2e-3,
-            delay=0.01 * delay,
-        )
-        return sampled_readings(sensor, TIMES, VALUES, RATES)
-
-    point = jnp.array([0.1, 1.0, 0.53])
-    readings = jax.jit(readings)
-    expected = central(readings, point, step=1e-3, order=4)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found = derivative(readings)(point)
-        assert_allclose(found, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
 
 
 QUANTITIES = [("deflection", None), ("velocity", None), ("acceleration", None), ("strain", 0.002)]

@@ -14,7 +14,7 @@ import jaxbeam as jb
 from jaxbeam.case.beam import rayleigh_coefficients
 from jaxbeam.case.case import replace, value_at
 from jaxbeam.model.layout import find_layout
-from jaxbeam.model.modes import mesh_layout, modes, safe_sqrt
+from jaxbeam.model.modes import mesh_layout, safe_sqrt
 from jaxbeam.model.transfer_matrices import critical_axial_force
 from tests.differences import central
 from tests.modules import ROOT
@@ -110,14 +110,6 @@ def test_taper_by_height():
     assert_allclose(by_height, frequencies(length=1.0, modes=4, segments=TAPERED), rtol=1e-12)
 
 
-@pytest.mark.parametrize("force", [-9.8, -5.0, 40.0, 4000.0])
-def test_axial_force(force):
-    """Closed form of two pins: omega^2 = (n pi)^4 + T (n pi)^2."""
-    k = np.arange(1, 6) * np.pi
-    found = frequencies(**UNIT, modes=5, axial_force=force)
-    assert_allclose(found, np.sqrt(k**4 + force * k**2), rtol=1e-11)
-
-
 @pytest.mark.parametrize(
     ("ends", "critical"),
     [
@@ -141,39 +133,6 @@ def test_rotary_inertia_alone():
     k = np.arange(1, 5) * np.pi
     found = frequencies(**UNIT, modes=4, rotary_inertia=0.01)
     assert_allclose(found, k**2 / np.sqrt(1 + 0.01 * k**2), rtol=1e-12)
-
-
-def test_stiff_shear_is_euler_bernoulli():
-    for ends in ("pinned-pinned", "clamped-free"):
-        thin, stiff = (
-            frequencies(**UNIT, ends=ends, modes=5, shear_stiffness=shear) for shear in (None, 1e14)
-        )
-        assert_allclose(stiff, thin, rtol=1e-11)
-
-
-def test_bearing_mass():
-    """A mass on a spring at the free end of a clamped beam: Rayleigh's equation of the tip."""
-    spring, mass = 20.0, 0.7
-    found = frequencies(
-        [jb.Support(1.0, stiffness=spring, mass=mass)], **UNIT, ends="clamped-free", modes=4
-    )
-    k = np.sqrt(found)
-    stiffness = (1 + np.cosh(k) * np.cos(k)) * k**3
-    tip = np.cosh(k) * np.sin(k) - np.sinh(k) * np.cos(k)
-    residual = (stiffness + (spring - mass * k**4) * tip) / (k**3 * np.cosh(k))
-    assert_allclose(residual, 0, atol=1e-9)
-
-
-def test_hinge_of_two_cantilevers():
-    """Clamped at both ends, hinged midway: symmetric modes are those of cantilevers of half length.
-
-    Antisymmetric ones have a zero deflection at the hinge: clamped and pinned.
-    """
-    found = frequencies(**UNIT, ends="clamped-clamped", modes=4, hinges=[jb.Hinge(0.5)])
-    cantilever = np.array([1.875104068711961, 4.694091132974175])
-    propped = np.array([3.926602312047919, 7.068582745628732])
-    expected = np.sort(np.concatenate([cantilever, propped])) ** 2 / 0.25
-    assert_allclose(found, expected, rtol=1e-11)
 
 
 def test_a_stiff_and_a_soft_half():
@@ -322,20 +281,6 @@ def test_buckling_with_shear(shear):
     assert_allclose(critical_axial_force(case, find_layout(case)), -critical, rtol=1e-10)
 
 
-def test_impulse_of_a_mass_at_a_hinge_vanishes_with_many_modes():
-    """m v [w'] / (1 + m sum psi^2) falls like 1 / n: the reason why such cases are refused."""
-    impulses = []
-    for count in (10, 20, 40):
-        beam = jb.Beam(**UNIT, modes=count, ends="clamped-clamped", hinges=[jb.Hinge(0.4)])
-        found = jb.modes(jb.Case(beam))
-        shape = found.shapes(0.4)
-        jump = found.shapes(0.4 + 1e-9, 1) - found.shapes(0.4 - 1e-9, 1)
-        sagging = jump @ (-shape / found.stiffness)
-        impulses.append(sagging / (1 + shape @ shape))
-    assert sagging > 0.1
-    assert_allclose(np.divide(impulses[:-1], impulses[1:]), 2.0, rtol=0.06)
-
-
 # Damping by material, hysteretic and Rayleigh damping.
 
 BRIDGE = {"flexural_rigidity": 1e10, "mass_per_length": 1e4, "modes": 4}
@@ -396,20 +341,6 @@ def test_loss_of_soft_shear_and_springs():
     springs = [jb.Support(x, stiffness=1e4) for x in (0.0, 20.0)]
     found = ratios(springs, length=20.0, segments=segments, ends="free-free")
     assert found[0] < 1e-5 and found[1] < 1e-5 and 0.0199 < found[2] < 0.02
-
-
-def test_gradient_of_a_loss():
-    def ratio(values):
-        segments = jb.Segment(values[0], loss_factor=values[1]), jb.Segment()
-        beam = jb.Beam(length=20.0, **BRIDGE, segments=segments, loss_factor=0.01)
-        return modes(jb.Case(beam), layout).damping_ratios
-
-    values = jnp.array([6.0, 0.1])
-    given = [jb.Segment(6.0, loss_factor=0.1), jb.Segment()]
-    layout = mesh_layout(jb.Case(jb.Beam(length=20.0, **BRIDGE, segments=given, loss_factor=0.01)))
-    assert_allclose(
-        jax.jit(jax.jacfwd(ratio))(values), central(ratio, values), rtol=1e-6, atol=1e-9
-    )
 
 
 def test_rayleigh_coefficients():
