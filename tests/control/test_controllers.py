@@ -179,32 +179,9 @@ def test_gradients_through_filter_hold_delay_and_saturation(plan, record, deriva
     assert_allclose(found / size, differences / size, rtol=1e-6, atol=1e-8)
 
 
-LAW = dataclasses.replace(
-    HELD,
-    actuators=(jb.Shaker(0.4, stiffness=500.0, damping=8.0, bandwidth=400.0),),
-    sensors=(jb.Sensor(0.25, filter=jb.Filter(30.0, 3, realisation="analogue")),),
-    controller=jb.Feedback([3e8], power=3),
-)
-
-
-def test_gradients_of_a_law_in_continuous_time():
-    names = ("controller.gains.0", "sensors.0.filter.cutoff", "actuators.0.damping", "loads.0.mass")
-    sizes = np.array([float(jb.addresses(LAW)[name]) for name in names])
-    plan = plan_for(LAW, substeps=2)
-
-    def outputs(point):
-        case = jb.replace(LAW, dict(zip(names, point * sizes, strict=True)))
-        found = jb.simulate(case, TIMES, plan)
-        return xp.stack([xp.sum((found.deflection * 1e3) ** 2), found.effort[0]])
-
-    differences = central(outputs, np.ones(len(names)), step=2e-3, order=6)
-    gradients = jax.jit(jax.jacrev(outputs))(jnp.ones(len(names)))
-    assert_allclose(gradients, differences, rtol=1e-6)
-
-
 # Controllers in case files and on the command line, and the errors of their settings.
 
-ACTUATOR, SENSOR = HELD.actuators[0], HELD.sensors[0]
+ACTUATOR = HELD.actuators[0]
 SAMPLED = "needs a controller that samples: give controller.period"
 ERRORS = [
     ({"actuators": ()}, "controller has nothing to command: add an actuator that takes commands"),

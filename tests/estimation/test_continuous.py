@@ -6,7 +6,6 @@ The beam has a mode more than the design, which has another mass and entry time 
 import dataclasses
 
 import control
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,9 +21,6 @@ from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.inversion import Inversion
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer
-from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
-from tests.differences import central
 from tests.loop_as_oracle import parts_of
 from tests.oracles.sampled_plant import SampledPlant
 
@@ -168,25 +164,6 @@ def test_poles_of_a_loop_with_an_observer():
     expected = np.concatenate([np.linalg.eigvals(A - B @ K), *observer_poles])
     found = np.asarray(linearised_loop(case, -1.0).poles())
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
-
-
-def test_gradients():
-    case = loop(ESTIMATORS["estimated"], modes=2)
-    names = ("process_noise", "measurement_intensity", "weight_deviation")
-    sizes = jnp.array([FORCE, INTENSITY, DEVIATION])
-    times = jnp.asarray(TIMES)
-    plan = IntegrationPlan(static_shapes(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
-
-    @jax.jit
-    def cost(point):
-        pairs = zip(names, point * sizes, strict=True)
-        changed = jb.replace(case, {f"controller.estimator.{name}": x for name, x in pairs})
-        record = jb.simulate(changed, times, plan)
-        return jnp.sum((record.deflection * 1e3) ** 2) + record.effort[0]
-
-    at = jnp.ones(3)
-    expected = central(cost, at, 1e-2)
-    assert_allclose(jax.jit(jax.jacfwd(cost))(at), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

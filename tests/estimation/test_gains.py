@@ -10,7 +10,6 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.estimation.kalman import Kalman
@@ -74,20 +73,6 @@ def test_sampled_kalman_gain():
     assert_allclose(matrix @ found[0] / scale[:, None], gain / scale[:, None], rtol=0, atol=1e-9)
     direct = scipy.linalg.solve_discrete_are(matrix.T, C.T, noise, R)
     assert_allclose(direct / outer, covariance / outer, rtol=0, atol=1e-9)
-
-
-def test_sampled_gain_tends_to_the_continuous_one():
-    """Samples with noise of covariance R / period tend to noise of intensity R."""
-    continuous, covariance = CONTINUOUS(A, C, Q, R)
-    scale = np.sqrt(np.diag(covariance))[:, None]
-    errors = []
-    for period in (2e-5, 1e-5):
-        step = transition(period)
-        gain, _ = SAMPLED(step.matrix, C, step.noise_covariance, R / period)
-        error = np.max(np.abs((gain / period - continuous) / scale))
-        errors.append(error / np.max(np.abs(continuous / scale)))
-    assert errors[1] < 0.01
-    assert errors[1] / errors[0] == pytest.approx(0.5, abs=0.02)
 
 
 @pytest.mark.parametrize("delay", [None, 7e-4])
@@ -304,62 +289,3 @@ def test_feedback_of_estimates(kalman, tolerance):
     truth = expected(case, TIMES, NumpyKalman(case, kalman.loads == "estimated"))
     for found, true in ((record.deflection, truth.deflection), (record.command, truth.command)):
         assert_allclose(found, true, rtol=0, atol=tolerance * np.max(np.abs(true)))
-
-
-def sampled_loop(case, modes):
-    """Transition of the closed loop over a period on a beam with some modes: plant and estimate."""
-    span, _, *parts = parts_of(case)
-    span = type(span)(span.length, span.flexural_rigidity, span.mass_per_length, modes, 0.01)
-    plant, design = SampledPlant(span, [], *parts), design_plant(case)
-    zero = np.zeros((plant.size, plant.size))
-    step, C = plant.step(0.0, LOOP_PERIOD, 0.0, zero), plant.matrices(0.0)[2]
-    design_step = design.step(0.0, LOOP_PERIOD, 0.0, np.diag([0, 0, LOOP_FORCE, LOOP_FORCE, 0.0]))
-    rows = design.matrices(0.0)[2]
-    covariance = scipy.linalg.solve_discrete_are(
-        design_step.transition.T, rows.T, design_step.noise, LOOP_NOISE**2 * np.eye(2)
-    )
-    gain = (
-        covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + LOOP_NOISE**2 * np.eye(2))
-    )
-    K = regulator(case)
-    correction = np.eye(design.size) - gain @ rows
-    estimate_matrix = correction @ (design_step.transition - design_step.after @ K)
-    return np.block(
-        [
-            [step.transition, -step.after @ K],
-            [gain @ C @ step.transition, estimate_matrix - gain @ C @ step.after @ K],
-        ]
-    )
-
-
-def test_spillover():
-    """A loop of high gain is stable on the beam of the design, unstable on that of more modes."""
-    radius = {}  # spectral radius on both beams, for two weights of the command
-    for weight in (0.3, 1e-4):
-        case = loop(Kalman(LOOP_FORCE, LOOP_NOISE), weight, None, loads=False)
-        found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
-        expected = np.linalg.eigvals(sampled_loop(case, 4))
-        largest = -np.sort(-np.abs(expected))[:6]
-        assert_allclose(-np.sort(-np.abs(found))[:6], largest, rtol=1e-6)
-        design = np.max(np.abs(np.linalg.eigvals(sampled_loop(case, LOOP_MODES))))
-        radius[weight] = design, largest[0]
-    assert max(radius[0.3]) < 1
-    assert radius[1e-4][0] < 1 < radius[1e-4][1]
-
-
-def test_gradients_through_loop_and_estimator():
-    case = loop(Kalman(LOOP_FORCE, LOOP_NOISE), modes=2)
-    names = ("controller.estimator.process_noise", "controller.command_weight.0", "loads.0.mass")
-    sizes = jnp.array([LOOP_FORCE, 0.01, 0.4])
-    plan = IntegrationPlan(static_shapes(case), 1, 0, False, 0.0, loop_schedule(case, TIMES))
-
-    @jax.jit
-    @jax.value_and_grad
-    def cost(point):
-        changed = jb.replace(case, dict(zip(names, point * sizes, strict=True)))
-        record = jb.simulate(changed, jnp.asarray(TIMES), plan)
-        return jnp.sum((record.deflection * 1e3) ** 2) + record.effort[0]
-
-    at = jnp.ones(3)
-    differences = central(lambda point: cost(point)[0], at, 1e-2)
-    assert_allclose(cost(at)[1], differences, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Kalman filters against brute-force Gaussian conditioning; statistics of innovations."""
+"""Kalman filters against brute-force Gaussian conditioning; loads that are followed; observers."""
 
 import dataclasses
 
@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.stats import chi2
 
 import jaxbeam as jb
 from jaxbeam.analysis.linearised_loop import linearised_loop
@@ -18,7 +17,6 @@ from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import xp
 from tests.control.optimal.test_scheduled_lqr import LENGTH, REST, expected_command, polynomial_law
 from tests.differences import central
 from tests.loop_as_oracle import expected, parts_of
@@ -128,56 +126,6 @@ def test_estimates_by_gaussian_conditioning(kalman, delay, samples, case):
         assert_allclose(estimate.weights[-1, 0], state[-1], rtol=1e-4)
     else:
         assert estimate.weights is None
-
-
-def test_innovations_and_errors_have_the_stated_covariance():
-    """Squares over their covariances follow chi-square distributions."""
-    runs, samples = 200, 8
-    random = np.random.default_rng(2)
-    steps, rows = oracle(CASE, samples)
-    state = np.zeros((runs, 6))
-    state[:, -1] = 0.4 * 9.81 + DEVIATION * random.normal(size=runs)
-    commands, readings = random.normal(size=(runs, samples, 1)), np.zeros((runs, samples, 4))
-    previous = np.zeros((runs, 1))
-    for k, (step, (C, D)) in enumerate(zip(steps, rows, strict=True)):
-        values, vectors = np.linalg.eigh(step.noise)
-        root = vectors * np.sqrt(np.maximum(values, 0))
-        command = commands[:, k]
-        state = state @ step.transition.T + previous @ step.before.T + command @ step.after.T
-        state, previous = state + random.normal(size=(runs, 6)) @ root.T, command
-        noise = NOISE * random.normal(size=(runs, 4))
-        readings[:, k] = state @ C.T + command @ D.T + OFFSET + noise
-    for_runs = jax.vmap(filter_readings, in_axes=(None, None, 0, 0))
-    filter_state, (estimate, squares) = for_runs(ESTIMATED, CASE, commands, readings)
-    low, high = chi2.interval(0.999, 4 * runs * samples)
-    assert low < np.sum(squares) < high
-    # The state of the shaker has no noise.
-    kept = np.array([0, 1, 2, 3, 5])
-    error = (np.asarray(filter_state.x) - state)[:, kept]
-    covariance = np.asarray(filter_state.covariance)[:, kept[:, None], kept]
-    squares = np.einsum("ri,ri->r", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    low, high = chi2.interval(0.999, 5 * runs)
-    assert low < np.sum(squares) < high
-    assert np.all(np.sqrt(covariance[:, 4, 4]) < 0.6 * DEVIATION)  # the readings reduce it
-    assert_allclose(estimate.weights[:, -1, 0], filter_state.x[:, -1])
-
-
-def test_gradients():
-    commands, readings = signals(8)
-
-    @jax.jit
-    @jax.value_and_grad
-    def misfit(point):
-        case = jb.replace(CASE, {"loads.0.mass": point[0], "sensors.0.noise": 1e-5 * point[1]})
-        kalman = dataclasses.replace(
-            ESTIMATED, process_noise=point[2] * FORCES, weight_deviation=point[3]
-        )
-        estimate = filter_readings(kalman, case, commands, readings)[1][0]
-        return jnp.sum((estimate.state[:, 2:4] * 100) ** 2)
-
-    at = jnp.array([0.4, 1.0, 1.0, 2.0])
-    differences = central(lambda point: misfit(point)[0], at, 1e-3)
-    assert_allclose(misfit(at)[1], differences, rtol=1e-6)
 
 
 # Extended Kalman filters: planted masses and speeds from scipy's motion of the beam.
@@ -320,24 +268,6 @@ def test_position_laws_read_the_followed_loads():
     assert_allclose(command, expected_command(loads, x, t), rtol=1e-9)
 
 
-def test_derivatives_by_settings_and_readings():
-    case = crossing(jb.MovingMass(mass=0.3, speed=2.0, entry_time=-0.003), modes=1, duration=0.1)
-    readings = deflections_by_scipy(case)[:4]
-    layout = mesh_layout(case)
-
-    def result(point):
-        estimator = dataclasses.replace(FOLLOWS, mass_deviation=0.15 * point[0])
-        design = designed(case, mass=0.3 * point[1], speed=2.0 * point[2])
-        loads = followed(estimator, design, readings * point[3], layout)[0][-1].loads
-        return xp.concatenate(loads)
-
-    point = np.ones(4)
-    differences = central(result, point, 1e-2)
-    assert_allclose(
-        jax.jit(jax.jacfwd(result))(jnp.asarray(point)), differences, rtol=1e-5, atol=1e-7
-    )
-
-
 @pytest.mark.parametrize(
     ("settings", "loads", "message"),
     [
@@ -440,39 +370,6 @@ def test_separation():
     found = np.linalg.eigvals(linearised_loop(case, 0.0).closed_matrix)
     found = found[np.abs(found) > 1e-6]  # the last command among the states has poles at zero
     assert_allclose(sorted_poles(found), sorted_poles(expected), atol=1e-7)
-
-
-def test_decay_of_the_error():
-    case = loop(Observer(poles=POLES), delay=4e-4)
-    controller, layout = case.controller, mesh_layout(case)
-    plant = SampledPlant(*parts_of(case))
-    step = plant.step(0.0, PERIOD, 4e-4, np.zeros((5, 5)))
-    _, _, C, D = plant.matrices(0.0)
-    commands = np.random.default_rng(0).normal(size=(60, 1))
-    state, previous, readings, states = np.array([1e-3, -1e-3, 0.1, 0.2, 0.0]), np.zeros(1), [], []
-    for command in commands:
-        state = step.transition @ state + step.before @ previous + step.after @ command
-        readings.append(C @ state + D @ command)
-        states.append(state)
-        previous = command
-
-    @jax.jit
-    def estimates(case):
-        plant = jb.state_space(case, layout=layout)
-        filter = controller.estimator.sampled_filter(plant, sample_timing(controller))
-
-        def update(state, sample):
-            measurement = Measurement(sample[0], jnp.zeros(5), sample[1])
-            estimate, state = filter.update(state, measurement, jnp.zeros(()))
-            return state, estimate.state
-
-        samples = jnp.asarray(readings), jnp.asarray(commands)
-        return jax.lax.scan(update, filter.initial_state(), samples)[1]
-
-    error = np.abs(estimates(case) - np.array(states)) / np.max(np.abs(states), 0)
-    decay = np.exp(-100 * PERIOD * np.arange(60))[:, None]
-    assert np.all(error < 30 * decay + 1e-12)
-    assert np.all(error[0, :4] > 1e-2)
 
 
 @pytest.mark.parametrize(

@@ -149,61 +149,6 @@ def test_estimates_are_the_most_probable_within_bounds(window, limit, least):
     assert_allclose((state - expected) / scale, 0.0, atol=2e-4)
 
 
-def test_the_weight_of_a_light_load_in_much_noise_is_closer_to_the_truth():
-    """Means of squared errors over 20 draws of a load of 0.02 kg and noise of its deflection."""
-    case = dataclasses.replace(
-        CASE,
-        beam=jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=1),
-        actuators=(),
-        sensors=(jb.Sensor(0.3),),
-        loads=(jb.MovingForce(mass=0.02, speed=6.0),),
-        controller=jb.Prescribed([], period=0.005),
-    )
-    noise = {"process_noise": 1e-4, "measurement_noise": 1e-3, "weight_deviation": 1.0}
-    design = dataclasses.replace(case, loads=(jb.MovingForce(mass=0.05, speed=6.0),))
-    times = 0.005 * np.arange(18)
-    truth = jb.simulate(dataclasses.replace(case, controller=None, run=jb.Run(0.1)), times)
-    random, errors = np.random.default_rng(4), []
-    filters = [
-        kind.sampled_filter(jb.state_space(design), sample_timing(case.controller)).tabulated(times)
-        for kind in (jb.MovingHorizon(**noise), jb.Kalman(**noise, loads="estimated"))
-    ]
-    for _ in range(20):
-        readings = truth.deflection + 1e-3 * random.normal(size=(18, 1))
-        last = []
-        for filter in filters:
-            state, estimate = filter.initial_state(), None
-            for t, reading in zip(times, readings, strict=True):
-                measurement = Measurement(reading, np.zeros(2), np.zeros(0))
-                estimate, state = filter.update(state, measurement, t)
-            assert estimate is not None
-            last.append(estimate.weights[0] - 0.02 * 9.81)
-        errors.append(last)
-    bounded, free = np.mean(np.square(errors), axis=0)
-    assert bounded < 0.7 * free
-
-
-@pytest.mark.parametrize("bounds", [{"min_weight": 15.0}, {"deflection_limit": 5e-6, "window": 3}])
-def test_derivatives_where_a_bound_is_met(bounds):
-    """By noise of the forces, mass, readings and the bound, forward."""
-    layout = mesh_layout(CASE)
-    commands, readings = (part[:3] for part in signals(SAMPLES))
-    (name, bound), *_ = bounds.items()
-
-    def last(point):
-        case = jb.replace(CASE, {"loads.0.mass": 0.4 * point[0]})
-        numbers = bounds | {name: bound * point[1]}
-        estimator = jb.MovingHorizon(FORCES * point[2], weight_deviation=DEVIATION, **numbers)
-        found = estimates(estimator, case, layout, readings * point[3], commands)[-1]
-        return found.state[2:4] * 1e4
-
-    point = np.ones(4)
-    expected = central(last, point, 1e-4)
-    assert np.max(np.abs(expected[:, 1])) > 1e-3, "the bound matters"
-    found = jax.jit(jax.jacfwd(last))(point)
-    assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.max(np.abs(expected)))
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

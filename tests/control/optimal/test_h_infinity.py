@@ -3,7 +3,6 @@
 import dataclasses
 import re
 
-import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -12,7 +11,6 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.h_infinity import minimax_law
-from tests.differences import central
 
 SIZES = {"output_size": 2e-4, "command_size": 4.0, "force_size": 4.0, "noise_size": 1e-5}
 LAW = jb.HInfinity(**SIZES, period=0.002)
@@ -99,25 +97,6 @@ def test_forces_are_rejected_and_vibration_dies():
     assert held.peak_deflection[0] < 0.5 * free.peak_deflection[0]
     late = np.asarray(held.times) > 0.26
     assert np.std(held.deflection[late]) < 0.1 * np.std(free.deflection[late])
-
-
-def test_derivatives_of_the_law():
-    plant = jb.state_space(beam_case())
-
-    def numbers(point):
-        law = jb.HInfinity(
-            output_size=2e-4 * point[0],
-            command_size=4.0 * point[1],
-            force_size=4.0,
-            noise_size=1e-5,
-            period=0.002,
-            attenuation=20.0,
-        )
-        found = minimax_law(law.game(plant), law.attenuation)
-        return found.D[0, 0]
-
-    expected = central(numbers, np.ones(2), 0.01)
-    assert_allclose(jax.jit(jax.grad(numbers))(jax.numpy.ones(2)), np.ravel(expected), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

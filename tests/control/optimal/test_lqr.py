@@ -111,48 +111,6 @@ def test_closed_loops(controller, name):
     assert_allclose(command, expected["voltage"][:last], rtol=0, atol=1e-6 * largest_voltage)
 
 
-def test_cost_of_the_optimal_gain(model):
-    """z0' P z0 is the cost of the run from z0, and no change of the gains lowers it."""
-    regulator = LQR(**WEIGHTS, points=400, horizon="crossing")
-    Q, R = regulator.weights(model)
-    start = jnp.array([1e-3, -2e-4, 1e-4, 0.02, 0.01, -0.03, 0.3])
-    table, costs = eqx.filter_jit(lambda m: regulator.crossing_gains(m))(model)
-    end = 0.6 / 0.55
-    times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by the Runge-Kutta method
-    step = times[1]
-    perturbation = jnp.asarray(np.random.default_rng(0).normal(size=(2, 7))) * table(
-        jnp.ones(()) / 2
-    )
-
-    @jax.jit
-    def cost(change):
-        def rate(t, state):
-            share = t / end
-            gain = table(share) + change[0] * perturbation[0] + change[1] * share * perturbation[1]
-            command, system = -gain @ state[:7], model.at(jnp.minimum(t, end - 1e-9))
-            cost_rate = state[:7] @ Q @ state[:7] + command @ R @ command
-            return jnp.append(system.A @ state[:7] + system.B[:, :1] @ command, cost_rate)
-
-        def advance(state, t):
-            a = rate(t, state)
-            b = rate(t + step / 2, state + step / 2 * a)
-            c = rate(t + step / 2, state + step / 2 * b)
-            d = rate(t + step, state + step * c)
-            return state + step / 6 * (a + 2 * b + 2 * c + d), None
-
-        last, _ = jax.lax.scan(advance, jnp.append(start, 0.0), times[:-1])
-        return last[7] + last[:7] @ Q @ last[:7]
-
-    predicted = start @ costs[0] @ start
-    assert_allclose(cost(jnp.zeros(2)), predicted, rtol=1e-6)
-    slope, second_difference = (
-        jax.jit(jax.jacfwd(cost))(jnp.zeros(2)),
-        cost(jnp.ones(2)) - predicted,
-    )
-    assert second_difference > 1e-3 * predicted
-    assert_allclose(slope, 0.0, atol=1e-6 * predicted)
-
-
 def test_intervals_needed_follow_from_the_modes_of_the_design():
     few = DesignModel(modes=1)
     check_case(beam_case(LQR([1.0] * 3, [1.0], points=100, design=few, horizon="crossing")))
@@ -271,17 +229,6 @@ def test_the_integral_stands_still_beyond_the_limits():
     for _ in range(1000):
         state = law.step(state, *rest, np.zeros(())).state
     assert_allclose(state, -PERIOD * 1e-2)  # of the first sample, whose command is beyond
-
-
-def test_derivative_by_the_weight_of_the_integral():
-    plant = jb.state_space(integral_beam_case(tracking()))
-
-    def gain(logarithm):
-        law = tracking(integral_weight=jnp.asarray(INTEGRAL) * jnp.exp(logarithm))
-        return law.time_invariant_gain(plant)[0]
-
-    found, expected = jax.jacfwd(gain)(0.0), central(gain, 0.0, 1e-3)[:, 0]
-    assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(

@@ -125,20 +125,6 @@ def test_gain_against_scipy_and_python_control(model, period):
     assert_close(found, control.dlqr(A, B, Q, R, N)[0], 1e-6)
 
 
-def test_gain_tends_to_that_of_the_continuous_regulator(model):
-    """Holding delays by half a period: the difference is of first order."""
-    exact = designed_gain(LQR(**WEIGHTS), model)
-    double, period_difference = (
-        np.max(
-            np.abs(designed_gain(LQR(**WEIGHTS, period=period, sampling="exact"), model) - exact)
-        )
-        / np.max(np.abs(exact))
-        for period in (2e-6, 1e-6)
-    )
-    assert period_difference < 0.02
-    assert double / period_difference == pytest.approx(2.0, abs=0.1)
-
-
 @pytest.mark.parametrize("options", [{"delay": 1.5e-3}, {"input_rate_weight": [1e-6]}, {}])
 def test_gain_has_the_least_cost(model, options):
     """The cost of runs from an initial state, integrated independently, is least for the gain."""

@@ -19,7 +19,6 @@ from jaxbeam.model.deflection_lines import influence_line, static_deflection_per
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.finite_horizon import GainTable
-from tests.differences import central
 
 WEIGHTS = {
     "state_weight": [1e3, 1e2, 0.1, 0.01, 0.0],
@@ -377,20 +376,6 @@ def test_before_the_entry_and_after_the_exit():
     sizes = np.array([0.3, 0.2]) + np.maximum(exit_speeds, 1.0)
     expected = np.array([0.3, 0.2]) @ (5.0 * sizes * np.exp(-gone / 0.05)) / 0.5
     assert_allclose(law.step((), x, REST, jnp.asarray(0.6)).command, -expected, rtol=1e-9)
-
-
-def test_derivative_by_masses_and_time():
-    law, x = polynomial_law((BRAKING, SECOND)), Estimate(jnp.array([0.7, -0.4]))
-
-    @jax.jit
-    def command(numbers):
-        mass = jnp.asarray(numbers[:2])
-        changed = dataclasses.replace(law, load_masses=mass, load_weights=9.81 * mass)
-        return changed.step((), x, REST, jnp.asarray(numbers[2])).command
-
-    point = jnp.array([0.3, 0.2, 0.3])
-    expected = central(command, point, 1e-3)
-    assert_allclose(jax.jit(jax.jacfwd(command))(point), expected, rtol=1e-7)
 
 
 def regulators():

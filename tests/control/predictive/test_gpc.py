@@ -3,8 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
@@ -20,7 +18,6 @@ from jaxbeam.control.gpc import (
     predicted_outputs,
     predictive_gains,
 )
-from tests.differences import central
 from tests.loop_as_oracle import span_of
 
 PERIOD, LIMITS = 0.01, [-3.0, 3.0]
@@ -120,22 +117,6 @@ def test_a_steady_load_leaves_no_error():
     tight = jb.simulate(jb.replace(case, {"actuators.0.limits.1": 1.0}))
     assert np.mean(tight.saturated[:, 0]) > 0.2
     assert np.abs(tight.deflection[-1]).max() < np.abs(still.deflection[-1]).max()
-
-
-def test_derivative_by_move_weight_and_plant():
-    """Of the gains of the last reading, through the polynomials."""
-    A, B, C = sampled_oracle()
-
-    @jax.jit
-    def gains(numbers):
-        model = polynomial_model(A * numbers[1], B, C)
-        weights = 1e-9 * numbers[0] * jnp.ones(2)
-        found = predictive_gains(model, (1, 3, 1), jnp.ones(2), weights, jnp.zeros(2))
-        return found.reading_gains[0].ravel() / 1e4
-
-    found = jax.jit(jax.jacfwd(gains))(jnp.ones(2))
-    expected = central(gains, np.ones(2), 1e-3)
-    assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(
@@ -289,25 +270,6 @@ def test_a_delay_that_the_design_lacks():
         peaks.append(np.max(np.abs(record.deflection)[record.times > 0.6]))
     free = jb.simulate(adaptive_beam_case(None, 8.0)).peak_deflection[0]
     assert peaks[0] > 2 * free and peaks[1] < 0.6 * free
-
-
-def test_derivatives_through_identification():
-    a, b = plant_by_scipy(8.0, 1)
-    commands, readings = signals(5, a, b)
-
-    def command(point):
-        law = dataclasses.replace(
-            designed(dataclasses.replace(ADAPTIVE, until=None, probe=None)), noise=1e-5 * point[0]
-        )
-        state = law.initial_state()
-        for k, (u, y) in enumerate(zip(commands, readings, strict=True)):
-            measured = Measurement(point[1] * np.array([y]), np.zeros(2), np.array([u]))
-            last = law.step(state, measured, np.asarray(k * ADAPTIVE_PERIOD))
-            state = last.state
-        return last.command
-
-    differences = central(command, np.ones(2), 1e-3)
-    assert_allclose(jax.jacfwd(command)(jnp.ones(2)), differences, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,9 @@
-"""Closed loops with predictive control: reference runs, limits, known loads, derivatives.
+"""Closed loops with predictive control: reference runs, limits, derivatives.
 
 Most loops use the plant frozen in the middle of each millisecond, which compiles fast.
 """
 
 import dataclasses
-import functools
 import json
 
 import equinox as eqx
@@ -12,23 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prediction import incremental_model
-from jaxbeam.control.state_controller import DesignModel
-from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.riccati import dlqr
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
 from tests.modules import DATA
-from tests.oracles.held_period import over_period
 
 REFERENCE = json.loads((DATA / "predictive_control.json").read_text())
 PERIOD = 0.01
@@ -201,34 +195,6 @@ def test_hildreth_in_the_loop(controlled, crossing):
     assert failures == 0
 
 
-def test_known_loads_reduce_the_deflection():
-    """A light mass, for which the patch is strong enough: less than half of the deflection."""
-    light = jb.replace(beam_case(mpc()), {"loads.0.mass": 0.1})
-    crossing = crossing_matrices(light)
-    unknown, command, _ = compiled_loop(light, crossing)
-    assert np.max(command) < 7.5
-    for prediction in ("time-invariant", "time-varying"):
-        controller = mpc(loads="known", prediction=prediction)
-        known, *_ = compiled_loop(dataclasses.replace(light, controller=controller), crossing)
-        assert np.linalg.norm(known) < 0.5 * np.linalg.norm(unknown)
-        assert np.max(np.abs(known)) < 0.8 * np.max(np.abs(unknown))
-
-
-def test_rate_limits_and_soft_limits(crossing):
-    slow = dataclasses.replace(PATCH, rate_limit=jnp.array(40.0))
-    _, command, failures = compiled_loop(beam_case(mpc(), patch=slow), crossing)
-    assert np.max(np.abs(np.diff(command, prepend=0.0))) <= 40.0 * PERIOD + 1e-9
-    assert failures == 0
-    # Large weights of moves and of deflections beyond 0.5 mm only.
-    settings = {"move_weight": 1e-8, "output_weight": 1e-4}
-    without, limited = (
-        compiled_loop(beam_case(mpc(**settings, soft_limit=limit)), crossing)[0]
-        for limit in (1.0, 5e-4)
-    )
-    assert np.max(np.abs(limited)) < np.max(np.abs(without))
-    assert np.sum(np.abs(limited) > 5.2e-4) < np.sum(np.abs(without) > 5.2e-4)
-
-
 def test_no_steady_deflection_under_an_unknown_constant_load(crossing):
     """The commands balance a constant force, and the beam comes to rest at zero."""
     A, B, _, *rest = crossing
@@ -283,15 +249,6 @@ def test_derivatives_of_a_closed_loop(crossing):
 # Law of predictive control against its formulas; settings in case files.
 
 
-def test_complete_laguerre_basis_equals_plain_moves():
-    states = jnp.asarray(np.random.default_rng(0).normal(size=(3, 6))) * 1e-3
-    plain, laguerre = (
-        commands(mpc(horizon=4, laguerre_pole=pole, solver="unconstrained"), states)
-        for pole in (None, 0.5)
-    )
-    assert_allclose(laguerre, plain, rtol=1e-6)
-
-
 def commands(controller, states, patch=PATCH, failing=False):
     """Commands at successive samples in given states, applied without limits of the actuators.
 
@@ -322,29 +279,6 @@ def incremental_plant(case):
     model = jb.state_space(case)
     system = model.unloaded.discretize(PERIOD)
     return system.A, system.B, system.C
-
-
-def test_unconstrained_law():
-    """Eq. (7.9) of the thesis, with weights."""
-    output_weight, horizon_weight = 3.0, np.linspace(1.0, 2.0, 6)
-    controller = mpc(
-        output_weight=output_weight, horizon_weight=horizon_weight, solver="unconstrained"
-    )
-    states = np.random.default_rng(0).normal(size=(2, 6)) * 1e-3
-    A, B, C = map(np.asarray, incremental_model(*incremental_plant(beam_case(controller))))
-    power = [np.linalg.matrix_power(A, n) for n in range(7)]
-    F = np.concatenate([C @ power[n] for n in range(1, 7)])
-    Phi = np.array(
-        [[(C @ power[i - j] @ B).item() if i >= j else 0 for j in range(4)] for i in range(6)]
-    )
-    weight = np.diag(output_weight * horizon_weight)
-    gain = np.linalg.solve(Phi.T @ weight @ Phi + 1e-11 * np.eye(4), Phi.T @ weight @ F)[0]
-    expected, previous = 0.0, np.zeros(6)
-    C = incremental_plant(beam_case(controller))[2]
-    for state, command in zip(states, commands(controller, jnp.asarray(states)), strict=True):
-        expected = expected - gain @ np.concatenate([state - previous, C @ state])
-        assert_allclose(command, [expected], rtol=1e-9)
-        previous = state
 
 
 def test_terminal_cost_gives_the_regulator():
@@ -402,152 +336,3 @@ def test_without_a_solution_the_last_command_is_held():
 def test_errors_of_settings(settings, words):
     with pytest.raises(ValueError, match=words):
         check_case(beam_case(mpc(**settings)))
-
-
-# Predictive control behind a Kalman filter of three of twelve modes; known loads.
-
-INTENSITY, NOISE = 0.05, 1e-6
-ESTIMATED_SAMPLES, ESTIMATED_SUBSTEPS = 40, 4
-
-
-def estimates(readings, commands):
-    """States (sample, state) of three modes by a Kalman filter in numpy."""
-    plant = jb.state_space(beam_case()).unloaded
-    A, B, C = map(np.asarray, (plant.A, plant.B, plant.C))
-    size = A.shape[0]
-    # Van Loan's exponentials: plant with its command, and noise of a period.
-    held = scipy.linalg.expm(PERIOD * np.block([[A, B], [np.zeros((1, size + 1))]]))
-    transition, input_matrix = held[:size, :size], held[:size, size:]
-    white = np.diag([0.0] * 3 + [INTENSITY] * 3)
-    block = scipy.linalg.expm(PERIOD * np.block([[-A, white], [np.zeros_like(A), A.T]]))
-    noise = transition @ block[:size, size:]
-    P = scipy.linalg.solve_discrete_are(transition.T, C.T, noise, NOISE**2 * np.eye(1))
-    gain = P @ C.T / (C @ P @ C.T + NOISE**2)
-    state, found = np.zeros(size), []
-    for reading, command in zip(readings, commands, strict=True):
-        state = transition @ state + input_matrix @ command
-        state = state + gain @ (reading - C @ state)
-        found.append(state)
-    return np.array(found)
-
-
-def test_filter_of_three_modes_on_twelve():
-    """Commands equal those of the law behind a filter in numpy; the peak is reduced by a sixth."""
-    settings = {"design": DesignModel(modes=3), "estimator": Kalman(INTENSITY, NOISE)}
-    case = beam_case(mpc(**settings), modes=12)
-    model = jb.state_space(case)
-    midpoints = (
-        (np.arange(ESTIMATED_SAMPLES * ESTIMATED_SUBSTEPS) + 0.5) * PERIOD / ESTIMATED_SUBSTEPS
-    )
-
-    @eqx.filter_jit
-    def loop(model, controlled):
-        system = jax.vmap(lambda t: model.at(t).discretize(PERIOD / ESTIMATED_SUBSTEPS))(midpoints)
-        loads = system.B[:, :, 1:] @ model.weights
-        parts = system.A, system.B[..., :1], loads
-        parts = [x.reshape(ESTIMATED_SAMPLES, ESTIMATED_SUBSTEPS, *x.shape[1:]) for x in parts]
-        law, C = case.controller.law(model), model.unloaded.C
-
-        def period(carry, sample):
-            state, previous, law_state = carry
-            t, *matrices = sample
-            readings = C @ state
-            command, law_state, _ = law.step(law_state, Measurement(readings, state, previous), t)
-            command = jnp.where(controlled, jnp.clip(command, *PATCH.limits), 0.0)
-            after, _ = jax.lax.scan(
-                lambda x, part: (part[0] @ x + part[1] @ command + part[2], None),
-                state,
-                tuple(matrices),
-            )
-            return (after, command, law_state), (readings, command, previous)
-
-        start = jnp.zeros(24), jnp.zeros(1), law.initial_state()
-        times = jnp.arange(ESTIMATED_SAMPLES) * PERIOD
-        return jax.lax.scan(period, start, (times, *parts))[1]
-
-    readings, commands, previous = loop(model, True)
-    uncontrolled = loop(model, False)[0]
-    states = estimates(np.asarray(readings), np.asarray(previous))
-    with_true_state = mpc()
-
-    @eqx.filter_jit
-    def commands_for(model):
-        law = with_true_state.law(model)
-
-        def step(law_state, sample):
-            state, previous = sample
-            measurement = Measurement(jnp.zeros(1), state, previous)
-            command, law_state, _ = law.step(law_state, measurement, 0.0)
-            return law_state, command
-
-        return jax.lax.scan(step, law.initial_state(), (jnp.asarray(states), previous))[1]
-
-    expected = commands_for(jb.state_space(beam_case(with_true_state)))
-    expected = np.clip(expected, *np.asarray(PATCH.limits))
-    assert np.ptp(expected) > 5
-    assert_allclose(commands, expected, rtol=0, atol=1e-5)
-    assert np.min(readings) > 0.83 * np.min(uncontrolled)
-
-
-def test_known_loads_within_limits():
-    """Each command against bounded least squares over the future commands, by scipy."""
-    controller = mpc(loads="known")
-    case = jb.replace(beam_case(controller), {"loads.0.entry_time": -0.1, "loads.0.mass": 0.4})
-    force = dataclasses.replace(case, loads=(jb.MovingForce(mass=0.4, speed=1.0, entry_time=-0.1),))
-    random = np.random.default_rng(1)
-    states = random.normal(size=(12, 6)) * [4e-4, 2e-5, 5e-6, 5e-3, 5e-4, 5e-4]
-    states[:, 0] -= 6e-4
-
-    @eqx.filter_jit
-    def commands_for(model):
-        law = controller.law(model)
-
-        def step(carry, sample):
-            command, law_state = carry
-            state, t = sample
-            measurement = Measurement(jnp.zeros(1), state, command)
-            command, law_state, _ = law.step(law_state, measurement, t)
-            return (command, law_state), command
-
-        start = jnp.zeros(1), law.initial_state()
-        times = jnp.arange(len(states)) * PERIOD
-        return jax.lax.scan(step, start, (jnp.asarray(states), times))[1]
-
-    commands = np.asarray(commands_for(jb.state_space(case)))[:, 0]
-    under_force = jb.state_space(force)
-    plant = under_force.unloaded.discretize(PERIOD)
-    A, B, C = (np.asarray(x) for x in (plant.A, plant.B[:, 0], plant.C[0]))
-
-    def matrices_at(t):
-        system = under_force.at(t)
-        return np.asarray(system.A), np.asarray(system.B)
-
-    @functools.cache
-    def force_input(period):
-        start = period * PERIOD
-        return over_period(matrices_at, start, start + PERIOD)[1][:, 1] * 0.4 * 9.81
-
-    horizon, moves, weight = THESIS["horizon"], THESIS["moves"], THESIS["move_weight"]
-    previous_state, previous, found = np.zeros(6), 0.0, []
-    for k, state in enumerate(states):
-        past, *future = map(force_input, range(k - 1, k + horizon))
-        unexplained = state - (A @ previous_state + B * previous + past)
-        fixed = state, previous, future, unexplained
-
-        def residuals(inputs, fixed=fixed):
-            state, previous, future, unexplained = fixed
-            outputs, x = [], state
-            for i, load_input in enumerate(future):
-                x = A @ x + B * inputs[min(i, moves - 1)] + load_input + unexplained
-                outputs.append(C @ x)
-            steps = np.diff(inputs, prepend=previous)
-            return np.append(np.array(outputs), np.sqrt(weight) * steps)
-
-        at_zero = residuals(np.zeros(moves))
-        slopes = np.stack([residuals(one) - at_zero for one in np.eye(moves)], axis=1)
-        scale = 1e5
-        best = lsq_linear(scale * slopes, -scale * at_zero, (-2.5, 7.5), tol=1e-14, method="bvls")
-        previous, previous_state = best.x[0], state
-        found.append(previous)
-    assert np.sum(np.isclose(found, 7.5)) >= 2 and np.sum(np.abs(found) < 7.4) >= 2
-    assert_allclose(commands, found, rtol=0, atol=1e-5)

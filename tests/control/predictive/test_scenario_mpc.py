@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 import scipy.signal
@@ -11,9 +10,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.modes import mesh_layout
 from tests.control.predictive.test_mpc_exact import affine, by_clarabel
-from tests.differences import central
 
 PERIOD, LIMITS, MOVE_WEIGHT = 0.01, (-4.0, 6.0), 1e-9
 BASE = {"horizon": 4, "moves": 3, "move_weight": MOVE_WEIGHT, "period": PERIOD}
@@ -163,28 +160,3 @@ def test_commands_against_an_independent_program(merit, hard_limit):
 def test_errors_of_settings(settings, words):
     with pytest.raises(ValueError, match=words):
         check_case(scenario_case(jb.ScenarioMPC(**BASE | settings)))
-
-
-@pytest.mark.parametrize("merit", ["mean", "worst"])
-def test_derivatives_by_factors_and_weights(merit):
-    """Of the first commands, by stiffness, delay and weight of the moves."""
-    settings = BASE | {"horizon": 2, "moves": 2, "merit": merit}
-    case = scenario_case(None)
-    layout = mesh_layout(case)
-
-    def first(point):
-        numbers = {
-            "stiffness_factors": 1.0 + 0.2 * point[0] * np.array([-1.0, 1.0]),
-            "delays": 0.002 * point[1] * np.array([1.0, 2.0]),
-            "move_weight": 1e-8 * point[2],
-        }
-        controller = jb.ScenarioMPC(**settings | numbers)
-        law = controller.law(jb.state_space(case, layout=layout))
-        x = STATES[0] / 5
-        measurement = Measurement(np.zeros(1), x, np.zeros(1))
-        return law.step(law.initial_state(), measurement, np.asarray(0.1)).command
-
-    point = np.ones(3)
-    expected = central(first, point, 1e-4)
-    found = jax.jit(jax.jacfwd(first))(point)
-    assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.max(np.abs(expected)))
