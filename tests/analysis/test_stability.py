@@ -23,7 +23,6 @@ from jaxbeam.analysis.linearised_loop import (
 )
 from jaxbeam.analysis.stability import (
     _assignment,
-    _tracked_branches,
     frozen_poles,
     growth,
     margins,
@@ -186,14 +185,6 @@ def test_a_jacobian_at_a_known_point_has_derivatives_by_traced_numbers():
     np.testing.assert_allclose(jax.jacfwd(jacobian)(3.0), 6.0 * matrix, rtol=1e-12)
 
 
-def test_crossing_branches_are_tracked():
-    t = np.linspace(-1, 1, 21)
-    up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3j + 0.05j
-    sorted_by_size = np.sort(np.stack([up, down], axis=1), axis=1)
-    followed = _tracked_branches(sorted_by_size)
-    np.testing.assert_array_equal(followed[:, 0], np.where(followed[0, 0] == up[0], up, down))
-
-
 @pytest.mark.parametrize("spread", [1.0, 0.01])
 def test_branches_have_the_poles_of_the_smallest_sum(spread):
     """Poles that coincide, as those of delays, and poles nearest to two branches at once."""
@@ -319,19 +310,6 @@ def test_floquet_multipliers_against_scipy():
     assert found.stable and found.period == 0.04
 
 
-def test_sampled_multipliers_converge_to_continuous():
-    def largest(period):
-        law = jb.StateFeedback(gain=GAIN, coordinates="sine", period=period)
-        return stream(
-            jb.replace(shaker_case(law, modes=2), {"loads.0.speed": 20.0}), 0.04
-        ).largest_multiplier
-
-    # A hold delays by half a period: the difference is of first order.
-    continuous = largest(None)
-    coarse, fine = (largest(period) - continuous for period in (4e-4, 2e-4))
-    assert coarse / fine == pytest.approx(2.0, abs=0.15)
-
-
 def test_limit_of_a_gain_is_its_gain_margin():
     """The mass of the load is negligible."""
     case = shaker_case(
@@ -363,24 +341,6 @@ def test_margins_against_python_control():
     # Without feedback the margins are infinite.
     open_loop = dataclasses.replace(loop, K=0.0 * loop.K)
     assert margins(open_loop) == (np.inf, 0.0, np.inf, np.inf, 1.0)
-
-
-def test_pole_is_on_unit_circle_at_gain_margin():
-    """The pole leaves the circle at -1, half the sampling frequency."""
-    loop = linearised_loop(shaker_case(regulator(period=0.002)), 0.0)
-    A, B, K = (np.asarray(part) for part in (loop.A, loop.B, loop.K))
-    gain = margins(loop).gain
-    assert np.abs(np.linalg.eigvals(A + gain * B @ K)).max() == pytest.approx(1.0, abs=1e-9)
-    for share in (0.2, 0.5, 0.99):
-        assert np.abs(np.linalg.eigvals(A + (1 + share * (gain - 1)) * B @ K)).max() < 1
-
-
-def test_delay_beyond_its_margin_destabilises():
-    found = margins(linearised_loop(shaker_case(jb.Feedback([1500.0], period=0.002), modes=2), 0.0))
-    for share, stable in ((0.98, True), (1.02, False)):
-        delayed = jb.Feedback([1500.0], period=0.002, delay=share * found.delay)
-        poles = linearised_loop(shaker_case(delayed, modes=2), 0.0).poles()
-        assert (poles.real.max() < 0) == stable
 
 
 def test_errors_are_named():

@@ -197,46 +197,6 @@ def test_data_are_part_of_the_package():
     assert json.loads((top / "bounds.json").read_text("utf-8"))
 
 
-@functools.cache
-def _response(name: str):
-    """Deflections (m) without commands, and those of each command, from the environment's maps."""
-    environment = jb.benchmark.Environment(load(name))
-    state, _ = environment.reset(TEST_SEEDS[0])
-    of_states, of_deflections = state.maps
-    count, states = environment.steps, state.plant.size
-    columns = np.zeros((states, 1 + count))
-    columns[:, 0] = state.plant
-    rows = []
-    for k in range(count):
-        unit = np.zeros(1 + count)
-        unit[1 + k] = 1
-        inputs = np.concatenate([columns, unit[None]])
-        deflection = np.asarray(of_deflections.linear[k, 0]) @ inputs
-        deflection[:, 0] += np.asarray(of_deflections.offset[k, 0])
-        rows.append(deflection)
-        columns = np.asarray(of_states.linear[k, 0]) @ inputs
-        columns[:, 0] += np.asarray(of_states.offset[k, 0])
-    return np.concatenate(rows)
-
-
-def test_a_linear_program_of_the_environment_has_the_same_bound():
-    """Another program: all rows at once, from the maps of the environment, without generation."""
-    problem, rows = load("unknown_mass"), _response("unknown_mass")
-    count = rows.shape[1] - 1
-    scale = np.abs(rows[:, 0]).max()
-    base, response = rows[:, 0] / scale, rows[:, 1:] / scale
-    matrix = np.concatenate([response, -response])
-    matrix = np.concatenate([matrix, -np.ones((len(matrix), 1))], axis=1)
-    (limits,) = [tuple(map(float, one.command_limits())) for one in problem.case.driven]
-    solution = scipy.optimize.linprog(
-        np.append(np.zeros(count), 1.0),
-        matrix,
-        -np.concatenate([base, -base]),
-        bounds=[limits] * count + [(0, None)],
-    )
-    assert_allclose(solution.x[-1] * scale, published("unknown_mass")["test"][0].bound, rtol=1e-6)
-
-
 PATCH = {"length": 0.6, "rigidity": 13.211, "density": 0.812}
 SHAKER = {"length": 0.6, "rigidity": 11.68, "density": 0.535}
 OWN = {  # beam, period, moving masses as (kg, m/s, s of entry), places, limits, rate

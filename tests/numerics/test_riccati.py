@@ -12,17 +12,10 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.control.lqr import LQR
-from jaxbeam.numerics.matrices import batch_axis_last
 from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
-from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
 from tests.differences import central
 
 R = jnp.array([[0.1, 0.02], [0.02, 0.3]])
-
-
-def cost_to_go(stages, terminal_cost):
-    """P at the start of each interval and at the end."""
-    return batch_axis_last(riccati_recursion, stages, jnp.zeros((1, 1)), terminal_cost)
 
 
 def plant(seed=0, states=6):
@@ -102,53 +95,6 @@ def test_equations_without_a_solution_are_refused():
     with pytest.raises(ValueError, match="no stabilising solution"):
         care(jnp.eye(6), 0 * B, Q, R)
     assert jnp.isnan(jax.jit(care)(jnp.eye(6), 0 * B, Q, R)).all()
-
-
-def varying(t):
-    """A(t) and B of an oscillator of varying stiffness and coupling, driven through a fast lag."""
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    stiff = -400.0 - 100 * jnp.sin(3 * t)
-    rows = [
-        [zero, one, zero],
-        [stiff, -1.0 * one, 20 + 5 * jnp.cos(2 * t)],
-        [zero, zero, -1e4 * one],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows]), jnp.array([[0.0], [0.0], [1e4]])
-
-
-def test_backward_equation_against_a_stiff_integrator():
-    """dP/dt = -PA - A'P - Q + P B R^-1 B'P by scipy's Radau at 1e-11, lag at 1e4 1/s."""
-    Q, weight = np.diag([1000.0, 0.1, 0.0]), np.array([[0.01]])
-    span, count = 1.0, 256
-    breakpoints = np.linspace(0.0, span, count + 1)
-    breakpoints = np.append(
-        breakpoints[:-1], span - (breakpoints[1] - breakpoints[0]) * 0.5 ** np.arange(13)
-    )
-    breakpoints = np.append(np.unique(breakpoints), span)
-    lengths = jnp.diff(jnp.asarray(breakpoints))
-
-    @jax.jit
-    def solve():
-        A, B = jax.vmap(jax.vmap(varying))(breakpoints[:-1, None] + lengths[:, None] * GAUSS_NODES)
-        stages = collocated_stages(A, B, jnp.asarray(Q), jnp.asarray(weight), lengths)
-        return cost_to_go(stages, jnp.asarray(Q))
-
-    def riccati_rate(s, cost):
-        t = span - s
-        A = np.array([[0, 1, 0], [-400 - 100 * np.sin(3 * t), -1, 20 + 5 * np.cos(2 * t)],
-                      [0, 0, -1e4]])  # fmt: skip
-        P = cost.reshape(3, 3)
-        BP = np.array([[0.0, 0.0, 1e4]]) @ P
-        return (P @ A + A.T @ P + Q - BP.T @ BP / weight).ravel()
-
-    indices = np.array([0, 64, 128, 192, 240])
-    times = span - breakpoints[indices]
-    solution = solve_ivp(
-        riccati_rate, (0.0, span), Q.ravel(), "Radau", times[::-1], rtol=1e-11, atol=1e-14
-    ).y.T[::-1]
-    found = np.asarray(solve())[indices]
-    for each, expected in zip(found, solution.reshape(-1, 3, 3), strict=True):
-        assert_allclose(each, expected, rtol=1e-8, atol=1e-11 * np.max(np.abs(expected)))
 
 
 # Optimal gains over whole crossings, against a stiff integration of the Riccati equation.

@@ -8,13 +8,11 @@ import jax
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import OptimizeResult, linprog
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import bound, input_influence, least_peak
-from jaxbeam.simulation.integration_plan import integration_plan
 from tests.modules import DATA as DATA_FOLDER
 
 DATA = json.loads((DATA_FOLDER / "bounds.json").read_text())
@@ -149,35 +147,6 @@ def test_shares_of_attainable_reduction(patch_bound):
     assert_allclose(nearby.share(uncontrolled), expected, rtol=1e-12)
 
 
-FEEDBACK_CASE = patched(controller=jb.StateFeedback(np.zeros((1, 10)), period=0.01))
-
-
-@pytest.fixture(scope="module")
-def feedback_plan():
-    return integration_plan(jb.replace(FEEDBACK_CASE, {"controller.gain": np.ones((1, 10))}))
-
-
-@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
-@settings(max_examples=8)
-@given(
-    mass=st.floats(0.1, 1.0),
-    speed=st.floats(0.5, 3.0),
-    strength=st.floats(1.0, 6.0),
-    seed=st.integers(0, 10**6),
-)
-def test_no_state_feedback_is_below_the_bound(feedback_plan, mass, speed, strength, seed):
-    """Full state feedback with random gains, saturated by the limits of the actuator."""
-    gain = np.random.default_rng(seed).standard_normal((1, 10)) * 10**strength
-    gain[0, 5:] *= 0.01  # rates in m/s beside deflections in m
-    sensor_influence = {"loads.0.mass": mass, "loads.0.speed": speed, "controller.gain": gain}
-    case = jb.replace(FEEDBACK_CASE, sensor_influence)
-    record = jb.simulate(case, plan=feedback_plan)
-    least = bound(case)
-    assert least.period == 0.01
-    assert np.max(np.abs(record.deflection)) >= least.peak * (1 - 1e-6)
-    assert least.share(record) <= 1 + 1e-6
-
-
 def test_more_positions_raise_the_bound(patch_bound):
     whole_beam = bound(patched(), positions=np.linspace(0.0, 0.6, 61))
     assert patch_bound.peak < whole_beam.peak < patch_bound.uncontrolled
@@ -215,14 +184,6 @@ def test_without_limits_one_position_is_held_at_zero_once_a_hold(influence):
     assert np.max(np.abs(at_hold_ends.deflection(commands))) < 1e-4 * np.max(
         np.abs(influence.unforced)
     )
-
-
-def test_shorter_holds_lower_the_bound():
-    case = patched(mass=0.2, speed=3.0, duration=0.2, controller=jb.Feedback([0.0], period=0.01))
-    long, short = bound(case, period=0.02), bound(case)
-    assert short.period == 0.01
-    assert short.commands.shape == (20, 1)
-    assert short.peak < long.peak * 0.999
 
 
 def test_two_actuators_and_a_shorter_last_hold():

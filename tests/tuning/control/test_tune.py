@@ -349,53 +349,6 @@ def test_absorber_without_controller():
 # The derivatives of runs by every number of every kind are in `tests/simulation/test_every_number`.
 
 GRADIENT_RUNS = tuning.full_grid({"loads.0.mass": [0.3], "loads.0.speed": [1.5]})
-REGULATOR = {"state_weight": [1e4, 1.0], "command_weight": [1e-3], "period": 0.01}
-LOOPS = {
-    "feedback": (
-        jb.Feedback([3000.0], period=0.01, delay=0.004),
-        {
-            "controller.gains.0": 3000.0,
-            "sensors.0.filter.cutoff": 20.0,
-            "sensors.0.position": 0.25,
-            "actuators.0.start": 0.2575,
-            "actuators.0.end": 0.3425,
-        },
-    ),
-    "output feedback": (
-        jb.OutputFeedback([[-3000.0]], period=0.01),
-        {"controller.gains.0.0": -3000.0},
-    ),
-    "regulator": (
-        jb.LQR(
-            estimator=jb.Kalman(process_noise=0.02, measurement_noise=1e-5),
-            **REGULATOR,
-        ),
-        {
-            "controller.state_weight.0": 1e4,
-            "controller.command_weight.0": 1e-3,
-            "controller.estimator.process_noise": 0.02,
-        },
-    ),
-    "sampled regulator": (
-        jb.LQR(**REGULATOR, sampling="exact"),
-        {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
-    ),
-    "finite": (
-        jb.LQR(**REGULATOR, points=24, horizon="crossing"),
-        {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
-    ),
-    "scheduled": (
-        jb.LQR(
-            **REGULATOR,
-            points=24,
-            masses=[0.2, 0.4],
-            speeds=[1.0, 2.0],
-            horizon="crossing",
-            schedule="load",
-        ),
-        {"controller.state_weight.0": 1e4, "controller.masses.0": 0.2},
-    ),
-}
 
 
 def gradient_rig(controller):
@@ -407,29 +360,6 @@ def gradient_rig(controller):
         controller=controller,
         run=jb.Run(duration=0.5, sample_rate=100.0),
     )
-
-
-@pytest.mark.parametrize("kind", LOOPS)
-def test_gradients_through_the_closed_loop(kind):
-    controller, start = LOOPS[kind]
-    case = gradient_rig(controller)
-    if kind != "feedback":  # without the filter it compiles faster
-        case = dataclasses.replace(case, sensors=[jb.Sensor(0.25)])
-    run_set = make_run_set(case, GRADIENT_RUNS)
-    sizes = np.array(list(start.values()))
-
-    @jax.jit
-    @jax.value_and_grad
-    def objective(shares):
-        values = dict(zip(start, shares * sizes, strict=True))
-        metrics = run_set.metrics(values, 50.0)
-        return metrics["peak"][0] + 0.1 * metrics["effort"][0]
-
-    ones = np.ones(sizes.size)
-    gradient = objective(jnp.asarray(ones))[1]
-    expected = central(lambda shares: objective(shares)[0], ones, step=1e-4)
-    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
-    assert np.all(np.abs(expected) > 1e-7)
 
 
 def test_gradients_of_a_bending_moment():

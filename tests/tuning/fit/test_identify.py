@@ -13,26 +13,20 @@ from jaxbeam.case.case import replace, value_at
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.cli import main
 from tests.cli.example import CONTROLLED_CASE
-from tests.differences import well_compiled
 from tests.oracles import finite_elements, modal_equations
 from tests.oracles.crossing import Load
 from tests.simulation.test_every_number import CASES, JUMPING_NUMBERS
 from tests.tuning.finite_element_rigs import (
-    NOISE as RIG_NOISE,
-    RATE as RIG_RATE,
     SAGGING,
     SHAKER,
     YIELDING,
-    Plant,
     SimulatedIdentification,
     autocorrelated,
     patch,
     plant,
 )
 from tuning import Fit, Log, identify
-from tuning.fit.dataset import make_dataset
-from tuning.fit.least_squares import LeastSquares, t_quantile
-from tuning.parameters import free_parameters, to_unbounded
+from tuning.parameters import to_unbounded
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 RATE = 500.0
@@ -435,92 +429,3 @@ def test_intervals_of_a_wrong_model_are_called_unreliable(identification):
     wrong = identification.fit(noise, free, stiffer)
     assert np.any(np.abs(identification.errors(wrong, free)) > THREE_ERRORS)
     assert "unreliable" in str(identification.result(noise, wrong))
-
-
-# Spring, damper and patch of a rig from planted logs: intervals hold the truth as often as stated.
-#
-# The logs are those of a finite-element beam that scipy integrates. In one a mass crosses while the
-# voltage of the patch is logged, in the other it crosses without a command.
-
-STIFFNESS, DAMPING = 3500.0, 40.0
-REPEATS = 30
-# Of thirty intervals that hold the truth with probability 0.95, fewer than 26 do so in one set of
-# 64 (binomial distribution).
-LEAST_COVERED = 26
-
-
-@pytest.fixture(scope="module")
-def rig() -> Plant:
-    """A patch, and beside it a spring and damper to ground.
-
-    The mass of the beam is weighed, and its own damping known: higher modes alone would
-    separate it from the damper.
-    """
-    actuators = [
-        jb.SpringDamper(0.5, stiffness=STIFFNESS, damping=DAMPING),
-        patch(0.2575, 0.447),
-    ]
-    suspension = finite_elements.Suspension(0.5, STIFFNESS, DAMPING)
-    sensors = [(0.15,), (0.3,), (0.45,)]
-    made = plant(1, 12.7, 0.812, actuators, [suspension], {}, sensors, 12, "pinned-pinned")
-    for known in ("beam.mass_per_length", "beam.damping_ratio"):
-        del made.truth[known]
-    return made
-
-
-class PlantedFits:
-    """Clean readings of both logs, and one least-squares problem for any noise."""
-
-    def __init__(self, rig: Plant):
-        times = np.arange(round(0.6 * RIG_RATE)) / RIG_RATE
-        voltage = 2.0 * np.sin(2 * np.pi * 9.0 * times + 25.0 * times**2)
-        commands = np.stack([voltage, 0 * voltage])
-        self.clean = np.stack([rig.readings(times, own[:, None]) for own in commands])
-        sensors = ("d1", "d2", "d3"), ("deflection",) * 3, ("m",) * 3
-        with_voltage = (*sensors[0], "u"), (*sensors[1], "voltage"), (*sensors[2], "V")
-        driven = Log(
-            times,
-            np.column_stack([self.clean[0], voltage]),
-            *with_voltage,
-            "driven",
-            sensors=(0, 1, 2, None),
-            actuators=(None, None, None, 1),
-        )
-        passive = Log(times, self.clean[1], *sensors, "passive", sensors=(0, 1, 2))
-        self.truth = np.array(list(rig.truth.values()))
-        start = {address: 1.1 * value for address, value in rig.truth.items()}
-        dataset = make_dataset(replace(rig.case, start), [driven, passive])
-        parameters = free_parameters(dataset.cases, dict.fromkeys(rig.truth), np.ptp(self.clean))
-        self.problem = LeastSquares(dataset, parameters)
-
-    def errors(self, seed: int) -> np.ndarray:
-        """Errors of the parameters of a fit to noisy logs, in half widths of their intervals."""
-        noise = np.random.default_rng(seed).normal(size=self.clean.shape)
-        solution = self.problem.solve(self.clean + RIG_NOISE["deflection"] * noise)
-        assert solution.converged
-        half_widths = t_quantile(solution.degrees_of_freedom) * solution.uncertainty.errors
-        # All are identified: known to some percent, the damper to a fifth.
-        assert np.all(half_widths / self.truth < [0.02, 0.1, 0.3, 0.05])
-        return (solution.values - self.truth) / half_widths
-
-
-@pytest.fixture(scope="module")
-def fits(rig):
-    with well_compiled():
-        yield PlantedFits(rig)
-
-
-def test_three_logs(fits):
-    errors = np.array([fits.errors(seed) for seed in range(3)])
-    assert np.all(np.abs(errors) < 2.0), errors  # four standard errors
-
-
-def test_intervals_of_thirty_logs_hold_the_truth(fits):
-    assert scipy.stats.binom.cdf(LEAST_COVERED - 1, REPEATS, 0.95) == pytest.approx(
-        1 / 64, rel=1e-2
-    )
-    errors = np.array([fits.errors(seed) for seed in range(REPEATS)])
-    covered = np.sum(np.abs(errors) < 1, axis=0)
-    assert np.all(covered >= LEAST_COVERED), covered
-    # The mean error of thirty, in standard errors of a mean: no bias.
-    assert np.all(np.abs(errors.mean(axis=0)) * 1.96 * np.sqrt(REPEATS) < 4), errors.mean(axis=0)
