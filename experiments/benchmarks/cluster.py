@@ -11,27 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 import jaxbeam as jb
 from experiments.benchmarks.common import (
-    FASTEST,
-    SLOWEST,
     one_span_case,
     parser,
     peak_memory,
     print_row,
     print_table,
+    sweep_grid,
 )
-
-
-def grid(runs: int) -> dict[str, np.ndarray]:
-    """A square grid of about so many runs over mass (kg) and speed (m/s)."""
-    side = round(runs**0.5)
-    return {
-        "loads.0.mass": np.linspace(0.1, 1.0, side),
-        "loads.0.speed": np.linspace(SLOWEST, FASTEST, side),
-    }
 
 
 def time_sweep(runs: int, client, store: Path) -> tuple[int, float]:
@@ -40,7 +28,9 @@ def time_sweep(runs: int, client, store: Path) -> tuple[int, float]:
     Raises RuntimeError if a run fails.
     """
     start = time.perf_counter()
-    results = jb.sweep(one_span_case(3), grid(runs), store=store, progress=False, client=client)
+    results = jb.sweep(
+        one_span_case(3), sweep_grid(runs), store=store, progress=False, client=client
+    )
     wall_time = time.perf_counter() - start
     if results.failed.any():
         raise RuntimeError(f"{int(results.failed.sum())} runs failed")

@@ -20,8 +20,10 @@ import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
+from jaxbeam.runtime.printer import markdown_table
 
 SLOWEST, FASTEST = 0.3, 10.0  # m/s, of the crossings of sweeps
+COMPILED_RUNS = 4096  # runs of the sweep by which everything is compiled
 
 
 class Timing(NamedTuple):
@@ -50,11 +52,11 @@ def time_call(function, *args, repeat=5, reference=None) -> Timing:
     A function `reference` is called before and after each warm call, so that changes of the
     machine's speed cancel in the ratio.
     """
-    cold, times = _seconds(function, *args), []
-    reference_times = [_seconds(reference or _no_operation)]
+    cold, times = seconds_of(function, *args), []
+    reference_times = [seconds_of(reference or _no_operation)]
     for _ in range(repeat):
-        times.append(_seconds(function, *args))
-        reference_times.append(_seconds(reference or _no_operation))
+        times.append(seconds_of(function, *args))
+        reference_times.append(seconds_of(reference or _no_operation))
     run = statistics.median(times)
     around = np.add(reference_times[:-1], reference_times[1:]) / 2
     ratio = reference_shortest = float("nan")
@@ -64,7 +66,8 @@ def time_call(function, *args, repeat=5, reference=None) -> Timing:
     return Timing(run, max(cold - run, 0.0), ratio, min(times), reference_shortest)
 
 
-def _seconds(function, *args) -> float:
+def seconds_of(function, *args) -> float:
+    """Wall time (s) of `function(*args)` until its results are ready."""
     start = time.perf_counter()
     jax.block_until_ready(function(*args))
     return time.perf_counter() - start
@@ -81,7 +84,7 @@ def interleaved_best(functions, *args, rounds=40) -> np.ndarray:
     """
     for function in functions:
         jax.block_until_ready(function(*args))
-    times = [[_seconds(function, *args) for function in functions] for _ in range(rounds)]
+    times = [[seconds_of(function, *args) for function in functions] for _ in range(rounds)]
     return np.min(times, axis=0)
 
 
@@ -121,26 +124,28 @@ def measure_in_subprocess(
 ) -> dict[str, float]:
     """The JSON that `python -m MODULE --measure ARGUMENTS` prints last, in its own process."""
     command = [sys.executable, "-m", module, "--measure", *map(str, arguments)]
-    process = subprocess.run(
-        command,
-        env=os.environ | dict(environment or {}),
-        check=True,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    variables = os.environ | dict(environment or {})
+    process = subprocess.run(command, env=variables, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(process.stdout.splitlines()[-1])
 
 
 def print_table(header: Sequence[str], right_from: int = 1) -> None:
     """Print header and ruler of a Markdown table; columns from `right_from` on are flush right."""
-    ruler = ["---" if i < right_from else "---:" for i in range(len(header))]
-    print_row(header)
-    print_row(ruler)
+    print("\n".join(markdown_table(header, (), right_from)), end="", flush=True)
 
 
 def print_row(cells: Sequence[str]) -> None:
     """Print a row of a Markdown table."""
     print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def sweep_grid(runs: int) -> dict[str, np.ndarray]:
+    """A square grid of about so many runs over mass (kg) and speed (m/s)."""
+    side = round(runs**0.5)
+    return {
+        "loads.0.mass": np.linspace(0.1, 1.0, side),
+        "loads.0.speed": np.linspace(SLOWEST, FASTEST, side),
+    }
 
 
 def one_span_case(modes: int) -> jb.Case:

@@ -8,7 +8,6 @@ design excluded. The steps are those of the crossing, on one core, compiled (see
 the median and the worst of them, and the time for each of 256 at once.
 """
 
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from jaxtyping import Float, Int
 
 import jaxbeam as jb
 from experiments.benchmarks import use_one_core
-from experiments.benchmarks.common import parser, print_row, print_table
+from experiments.benchmarks.common import parser, print_row, print_table, seconds_of
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep, Measurement
 from jaxbeam.case.fields import concrete, kinds
 from jaxbeam.control.sampled_lqr import SamplingWarning
@@ -97,7 +96,7 @@ def time_steps(
         return _step_batch(law, state, batch, times[batch_indices])
 
     all_at_once()  # compiles
-    batched = [_seconds(all_at_once) / BATCH_SIZE for _ in range(2 * ATTEMPTS + 1)]
+    batched = [seconds_of(all_at_once) / BATCH_SIZE for _ in range(2 * ATTEMPTS + 1)]
     return ComputingTimes(
         *(
             float(x)
@@ -136,18 +135,12 @@ def _step_batch(law: AbstractSampledLaw, state, measurements, times) -> ControlS
 
 def _time_per_step(repeat: Callable[[int], Any]) -> float:
     """Time (s) of one repetition, without that of the call."""
-    once = min(_seconds(lambda: repeat(1)) for _ in range(ATTEMPTS))
-    few = min(_seconds(lambda: repeat(9)) for _ in range(ATTEMPTS))
+    once = min(seconds_of(lambda: repeat(1)) for _ in range(ATTEMPTS))
+    few = min(seconds_of(lambda: repeat(9)) for _ in range(ATTEMPTS))
     one = max((few - once) / 8, 1e-8)
     count = int(np.clip(MIN_TIMED_DURATION / one, 8, MAX_REPETITIONS))
-    many = min(_seconds(lambda: repeat(1 + count)) for _ in range(ATTEMPTS))
+    many = min(seconds_of(lambda: repeat(1 + count)) for _ in range(ATTEMPTS))
     return max(many - once, 0.0) / count
-
-
-def _seconds(call: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    jax.block_until_ready(call())
-    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

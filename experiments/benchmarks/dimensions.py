@@ -87,7 +87,7 @@ def main() -> None:
             module = "experiments.benchmarks.dimensions"
             found: dict[str, float] = {}
             for quantity in ("time", "memory"):
-                found |= measure_in_subprocess(module, quantity, dimension, size, environment={})
+                found |= measure_in_subprocess(module, quantity, dimension, size)
             memory, a_step = found["memory"], 1e6 * found["run"] / found["steps"]
             # Samples are the steps of a run; modes shorten steps.
             amount = found["run"] if dimension == "samples" else a_step

@@ -17,19 +17,18 @@ import time
 
 import xarray
 
-from experiments.benchmarks.cluster import grid
 from experiments.benchmarks.common import (
+    COMPILED_RUNS,
     measure_in_subprocess,
     one_span_case,
     parser,
     peak_memory,
     print_row,
     print_table,
+    sweep_grid,
     without_native,
 )
 from jaxbeam.sweeps.sweep import sweep
-
-COMPILED_RUNS = 4096  # runs of the sweep by which everything is compiled
 
 
 def measure(runs: int, native: bool = False) -> dict[str, float]:
@@ -37,13 +36,13 @@ def measure(runs: int, native: bool = False) -> dict[str, float]:
 
     With `native` by the C code, where there is a compiler. Raises RuntimeError if a run fails.
     """
-    case, times, over = one_span_case(3), [], grid(runs)
+    case, times, over = one_span_case(3), [], sweep_grid(runs)
     xarray.Dataset({"loaded": ("run", [0.0])})  # xarray imports modules at first use
     # Shapes of blocks depend on the number of masses: all of them and some speeds compile all.
     speeds = over["loads.0.speed"]
     some = over | {"loads.0.speed": speeds[:: -(-len(speeds) // 16)]}
     before = 0.0
-    for values in (grid(COMPILED_RUNS), grid(COMPILED_RUNS), some, over):
+    for values in (sweep_grid(COMPILED_RUNS), sweep_grid(COMPILED_RUNS), some, over):
         before = peak_memory()
         start = time.perf_counter()
         with contextlib.nullcontext() if native else without_native():

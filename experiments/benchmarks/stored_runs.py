@@ -16,17 +16,16 @@ import time
 from pathlib import Path
 
 import jaxbeam as jb
-from experiments.benchmarks.cluster import grid
 from experiments.benchmarks.common import (
+    COMPILED_RUNS,
     measure_in_subprocess,
     one_span_case,
     parser,
     peak_memory,
     print_row,
     print_table,
+    sweep_grid,
 )
-
-COMPILED_RUNS = 4096  # runs of the sweep by which everything is compiled
 
 
 def measure(runs: int) -> dict[str, float]:
@@ -37,9 +36,9 @@ def measure(runs: int) -> dict[str, float]:
     case = one_span_case(1)
     with tempfile.TemporaryDirectory() as folder:
         first, store = Path(folder) / "first.zarr", Path(folder) / "runs.zarr"
-        jb.sweep(case, grid(COMPILED_RUNS), store=first, progress=False)
+        jb.sweep(case, sweep_grid(COMPILED_RUNS), store=first, progress=False)
         before, start = peak_memory(), time.process_time()
-        results = jb.sweep(case, grid(runs), store=store, progress=False)
+        results = jb.sweep(case, sweep_grid(runs), store=store, progress=False)
         seconds, count = time.process_time() - start, results.failed.size
         if results.failed.any():
             raise RuntimeError(f"{int(results.failed.sum())} runs failed")
@@ -60,8 +59,7 @@ def main() -> None:
     print_table(("runs", "seconds", over, "MiB", over, "MiB on disk", over), right_from=0)
     first: dict[str, float] = {}
     for runs in arguments.runs:
-        module = "experiments.benchmarks.stored_runs"
-        found = measure_in_subprocess(module, runs, environment={})
+        found = measure_in_subprocess("experiments.benchmarks.stored_runs", runs)
         first = first or found
         cells = [f"{found['runs']:.0f}"]
         for name in ("seconds", "memory", "disk"):

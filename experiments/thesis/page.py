@@ -28,6 +28,7 @@ from experiments.thesis.verdicts import (
     STATEMENT,
     VERDICTS,
 )
+from jaxbeam.runtime.printer import markdown_table
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "thesis.md"
@@ -90,7 +91,7 @@ def page(report: dict) -> str:
             rows.append((name, *(str(own[word]) for word in ALL_VERDICTS)))
     rows.append(("all", *(str(counts(report)[word]) for word in ALL_VERDICTS)))
     readings = {one["rig"]: one["reading of the rig"] for _, one in findings(report)}
-    parts = [INTRODUCTION, sentence(report), "", _table(header, rows), ""]
+    parts = [INTRODUCTION, sentence(report), "", *markdown_table(header, rows, right_from=1)]
     parts += ["## Reading of each rig", "", *(f"- {rig}: {its}." for rig, its in readings.items())]
     parts += [""]
     for verdict in VERDICTS[1:]:
@@ -116,11 +117,6 @@ def _line(one: dict, verdict: str) -> str:
     }
     reason = reasons[verdict]
     return f"- {one['where']}, {one['what']}: {pairs}" + (f": {reason}." if reason else ".")
-
-
-def _table(header, rows) -> str:
-    lines = [header, ("---", *["---:"] * (len(header) - 1)), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def with_counts(text: str, report: dict) -> str:

@@ -43,9 +43,24 @@ class Tolerance:
     digits: float = 0.0
 
 
+DIGITS = Tolerance("computed: a unit of the last printed digit", digits=1)
+# 11.68 N m^2 and 0.535 kg/m are rounded by 0.04 and 0.09 %, frequencies by half of the sum.
+FORMULA = Tolerance(
+    "follows from 11.68 N m^2 and 0.535 kg/m as far as their digits go", digits=1, relative=0.0007
+)
+SAMPLE_INSTANT = Tolerance("an instant of a sampled run, to one sample", absolute=0.01)
+# Variances of the sensors by section 5.1: 0.0365, 0.135, 0.0729 times 1e-10 m^2; the noisiest.
+NOISE = 2e3 * np.sqrt(0.135e-10)  # mm, two standard deviations
+MEASURED = Tolerance("measured: twice the noise of a sensor (5.1)", absolute=float(NOISE))
+SAME_CURVE = Tolerance("called identical: the width of a line in a figure", absolute=1.0)
+YES_OR_NO = Tolerance("yes (1) or no (0)", absolute=0.5)
+
+HZ = "Hz"
+
+
 @dataclasses.dataclass(frozen=True)
 class PublishedNumbers:
-    """Published numbers of one quantity: location, unit, origin, tolerance, and the digits.
+    """Published numbers of one quantity: location, unit, digits, origin, and tolerance.
 
     `printed_text` holds the numbers as printed, separated by spaces, and `labels` a name for each.
     `rig` is the physical rig that they are of, and the chapter: one reading serves for all of it.
@@ -58,10 +73,10 @@ class PublishedNumbers:
     location: str
     quantity: str
     unit: str
-    origin: str
-    tolerance: Tolerance
     printed_text: str
     labels: str = ""
+    origin: str = "computed"
+    tolerance: Tolerance = DIGITS
     interpretation: str = ""
     repeats: str = ""
     repeated_labels: str = ""
@@ -108,6 +123,35 @@ class PublishedNumbers:
         return np.abs(np.asarray(values) - self.numbers) <= self.allowed_error * (1 + 1e-9)
 
 
+def measured_peaks(
+    location: str, quantity: str, printed_text: str, labels: str, **others
+) -> PublishedNumbers:
+    """Measured peaks (mm), to within the noise of a sensor; `others` are further fields."""
+    return PublishedNumbers(
+        location, quantity, "mm", printed_text, labels, "measured", MEASURED, **others
+    )
+
+
+def measured_shares(
+    location: str,
+    quantity: str,
+    printed_text: str,
+    peaks: Sequence[float],
+    labels: str = "",
+    runs: int = 1,
+    **others,
+) -> PublishedNumbers:
+    """Ratios (%) of two measured peaks, the means over `runs` runs; `others` are further fields.
+
+    The tolerance is in points, for each of `peaks` (mm) without control.
+    """
+    points = tuple(float(100 * NOISE * np.sqrt(2 / runs) / peak) for peak in peaks)
+    tolerance = Tolerance("measured: twice the noise of a sensor (5.1), in both peaks", 0, points)
+    return PublishedNumbers(
+        location, quantity, "%", printed_text, labels, "measured", tolerance, **others
+    )
+
+
 def _last_digit_unit(word: str) -> float:
     """One unit of the last printed digit; zeros at the end of long whole numbers are not digits."""
     digits, _, exponent = word.lower().partition("e")
@@ -117,32 +161,6 @@ def _last_digit_unit(word: str) -> float:
     if len(digits.lstrip("+-")) <= SHORT_WHOLE_NUMBER:
         return scale
     return scale * 10.0 ** (len(digits) - len(digits.rstrip("0")))
-
-
-DIGITS = Tolerance("computed: a unit of the last printed digit", digits=1)
-# 11.68 N m^2 and 0.535 kg/m are rounded by 0.04 and 0.09 %, frequencies by half of the sum.
-FORMULA = Tolerance(
-    "follows from 11.68 N m^2 and 0.535 kg/m as far as their digits go", digits=1, relative=0.0007
-)
-SAMPLE_INSTANT = Tolerance("an instant of a sampled run, to one sample", absolute=0.01)
-# Variances of the sensors by section 5.1: 0.0365, 0.135, 0.0729 times 1e-10 m^2; the noisiest.
-NOISE = 2e3 * np.sqrt(0.135e-10)  # mm, two standard deviations
-MEASURED = Tolerance("measured: twice the noise of a sensor (5.1)", absolute=float(NOISE))
-
-
-def of_two_peaks(*peaks: float, runs: int = 1) -> Tolerance:
-    """Tolerance (points) of a ratio of two measured peaks, for each uncontrolled peak (mm).
-
-    Peaks are means over `runs` runs.
-    """
-    points = (float(100 * NOISE * np.sqrt(2 / runs) / peak) for peak in peaks)
-    return Tolerance("measured: twice the noise of a sensor (5.1), in both peaks", 0, tuple(points))
-
-
-SAME_CURVE = Tolerance("called identical: the width of a line in a figure", absolute=1.0)
-YES_OR_NO = Tolerance("yes (1) or no (0)", absolute=0.5)
-
-HZ = "Hz"
 
 
 REPRODUCED, EXPLAINED = "reproduced", "explained"
@@ -299,11 +317,6 @@ def readings_of(group: Sequence[Finding]) -> list[Reading]:
         for reading in readings
         if all(reading & one.answers in one.readings for one in group)
     ]
-
-
-def likeliest_reading(group: Sequence[Finding]) -> Reading:
-    """The reading with the least misfit over all findings of a rig."""
-    return min(readings_of(group), key=lambda reading: _misfit(group, reading))
 
 
 def _misfit(group: Sequence[Finding], reading: Reading | None) -> float:

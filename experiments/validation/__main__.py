@@ -8,33 +8,21 @@ It needs a clone of the repository, whose tests have the independent references.
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
 
+from experiments.validation import checks
 from experiments.validation.checks import PAGE_FILE, Check, validation_page
 from jaxbeam.simulation.simulate import ContactLossWarning
 
-
-def check_groups() -> tuple[Callable[[], Iterator[Check]], ...]:
-    """Functions that yield the checks of a group, whose title is their docstring.
-
-    Raises RuntimeError outside a clone of the repository, whose tests have the references.
-    """
-    try:
-        from experiments.validation import checks
-    except ModuleNotFoundError as error:
-        raise RuntimeError(
-            f"the references are in the repository, not in the package ({error});"
-            " run this from the root of a clone"
-        ) from None
-    return (
-        checks.frequencies,
-        checks.statics,
-        checks.crossings,
-        checks.energy,
-        checks.gradients,
-        checks.loops,
-        checks.bounds,
-    )
+# They yield the checks of a group, whose title is their docstring.
+GROUPS = (
+    checks.frequencies,
+    checks.statics,
+    checks.crossings,
+    checks.energy,
+    checks.gradients,
+    checks.loops,
+    checks.bounds,
+)
 
 
 def run_checks() -> list[tuple[str, list[Check]]]:
@@ -43,7 +31,7 @@ def run_checks() -> list[tuple[str, list[Check]]]:
     with warnings.catch_warnings():
         # Moving masses that would lift off solve the same equations.
         warnings.simplefilter("ignore", ContactLossWarning)
-        for group in check_groups():
+        for group in GROUPS:
             start = time.perf_counter()
             results.append((str(group.__doc__).rstrip("."), list(group())))
             print(f"{group.__name__}: {time.perf_counter() - start:.0f} s", flush=True)

@@ -32,6 +32,7 @@ from experiments.validation.modal_identification import (
     log_of,
 )
 from jaxbeam.files.report import ReportTable
+from jaxbeam.runtime.printer import markdown_table
 from tests.oracles.planted_structures import Planted, random_structure, sampled
 from tuning.logs.log import Log
 from tuning.modal.identify_modes import identify_modes
@@ -168,8 +169,7 @@ def excitations(count: int) -> ReportTable:
 
 
 def _write(result: ReportTable, path: Path) -> None:
-    lines = [result.header, ["---"] * len(result.header), *result.rows]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    text = "\n".join(markdown_table(result.header, result.rows))
     path.write_text(text, encoding="utf-8")
     print(text)
 

@@ -23,6 +23,7 @@ from experiments.validation.modal_identification import (
     compare,
     log_of,
 )
+from jaxbeam.runtime.printer import markdown_table
 from tests.oracles.planted_structures import Planted, random_structure, sampled
 from tuning.modal.identify_modes import identify_modes
 from tuning.modal.setups import merge_setups
@@ -108,9 +109,9 @@ def main(arguments: list[str]) -> None:
     every = (seed for seed in itertools.count(FIRST_SEED) if _channels(seed) >= 4)
     seeds = list(itertools.islice(every, count))
     rows = [assess(kind, seeds) for kind in kinds]
-    lines = ["| " + " | ".join(row) + " |" for row in (HEADER, ["---"] * len(HEADER), *rows)]
-    TABLE_FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(lines))
+    text = "\n".join(markdown_table(HEADER, rows))
+    TABLE_FILE.write_text(text, encoding="utf-8")
+    print(text)
 
 
 def _channels(seed: int) -> int:

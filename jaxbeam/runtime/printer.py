@@ -113,9 +113,10 @@ def _row_lines(row: Row, marks: Row, widths: list[int], is_header: bool) -> Iter
         yield (" " * GAP).join(parts)
 
 
-def markdown_table(header: Row, rows: Iterable[Row]) -> list[str]:
-    """Lines of a table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
+def markdown_table(header: Row, rows: Iterable[Row], right_from: int | None = None) -> list[str]:
+    """Lines of a table in Markdown; columns from `right_from` on, if any, are flush right."""
+    left = len(header) if right_from is None else right_from
+    lines = [header, ["---"] * left + ["---:"] * (len(header) - left), *rows]
     return [f"| {' | '.join(line)} |" for line in lines] + [""]
 
 

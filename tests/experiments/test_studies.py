@@ -27,7 +27,6 @@ from experiments.studies.patch_drift import (
     log_of_patch,
     remaining_errors,
 )
-from experiments.studies.shaker_drives import LOOPS, drive
 from experiments.studies.tune_feedforward import COMMAND_LIMITS
 from experiments.thesis.cases import data_physics_v4
 from jaxbeam import rigs
@@ -333,14 +332,6 @@ def test_force_under_a_force_loop():
     coil = (0.5, 0.82, 5e-5, 4.2, 4.2, 0.02, 9700.0, 0.55)
     closed = force(jb.Electrodynamic(*coil, inner_loop=jb.actuators.ForceLoop(bandwidth=bandwidth)))
     assert_allclose(closed, open_loop / (1 + open_loop), rtol=1e-9)
-
-
-def test_what_the_page_of_drives_says():
-    by_voltage, by_current, _, by_force, _ = (drive(loop) for loop in LOOPS.values())
-    assert 9 < by_voltage.precise_to < 10 and by_force.precise_to == 100
-    assert_allclose([by_voltage.damping, by_force.damping], [0.089, 0.033], atol=5e-4)
-    assert by_current.largest > 3 * by_voltage.largest
-    assert by_current.damping < by_voltage.damping
 
 
 # The tuned feedforward laws in the repository: bounds, held-out loads, and their performance.

@@ -8,7 +8,7 @@ import pytest
 
 import jaxbeam as jb
 from experiments.validation import random_cases
-from experiments.validation.__main__ import check_groups
+from experiments.validation.__main__ import GROUPS
 from experiments.validation.checks import Check, validation_page
 from experiments.validation.least_errors import (
     TELLING_GAIN,
@@ -51,7 +51,7 @@ def test_page_marks_errors_above_their_tolerance(error, mark, count):
     assert f"| peaks | closed form | {error:.1e} | 1e-06 | {mark} |" in text
 
 
-@pytest.mark.parametrize("group", check_groups(), ids=lambda group: group.__name__)
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_errors_are_within_their_tolerances(group):
     checks = list(group())

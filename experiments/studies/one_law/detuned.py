@@ -27,11 +27,13 @@ from experiments.studies.one_law.plants import (
     DELAYS,
     ONE_LAW,
     RIGIDITY,
+    SPANS,
     Shares,
     cell,
     plant_case,
 )
 from experiments.studies.one_law.tune import CUTOFF, with_numbers
+from jaxbeam.runtime.printer import markdown_table
 from tuning.control.load_cases import AddressValues
 
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law_detuned.md"
@@ -41,7 +43,6 @@ OUTER_SPEEDS = {"B": (0.4, 1.05), "C": (0.6, 1.05)}  # m/s
 # Sizes of the values below zero and above, and the reference: see `tune`.
 WORST_CASE = np.array([1.0, 0.64, 0.14, 0.3, 0.39, 0.59, 0.69, 0.82, 0.93, 1.0, 0.49])
 HEADER = "rigidity", "not known", "known to the law", "law for the worst case", "other loads"
-SPANS = {"B": "one span", "C": "two spans"}
 
 
 def with_known_rigidity(case: jb.Case, factor: float) -> jb.Case:
@@ -86,13 +87,13 @@ def row(rig: str, factor: float, shares: Shares) -> tuple[str, ...]:
 
 def main(arguments: list[str]) -> None:
     """Print the table, and write it for the page with `--pages`."""
-    shares, rows = Shares(), [HEADER, ("---", *("---:",) * (len(HEADER) - 1))]
+    shares, rows = Shares(), []
     for rig in SPANS:
         for factor in FACTORS:
             rows.append(row(rig, factor, shares))
             print(" | ".join(rows[-1]), flush=True)
     if "--pages" in arguments:
-        text = "\n".join("| " + " | ".join(cells) + " |" for cells in rows) + "\n"
+        text = "\n".join(markdown_table(HEADER, rows, right_from=1))
         TABLE_FILE.write_text(text, encoding="utf-8")
 
 

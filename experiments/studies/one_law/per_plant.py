@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.studies.held_out import held_out_loads, training_loads
-from experiments.studies.one_law.plants import ONE_LAW, Shares, cell, plant_case
+from experiments.studies.one_law.plants import ONE_LAW, SPANS, Shares, cell, plant_case
 from experiments.studies.one_law.tune import (
     CUTOFF,
     DELAYS,
@@ -31,11 +31,11 @@ from experiments.studies.one_law.tune import (
     with_numbers,
 )
 from jaxbeam.control.internal_model import REFERENCE, VALUES
+from jaxbeam.runtime.printer import markdown_table
 
 GENERATIONS = 8
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law_per_plant.md"
 HEADER = "rig", "delay", "rigidity", "one law for all", "the same law, tuned for the plant"
-SPANS = {"B": "one span", "C": "two spans"}
 
 
 def losses(rig: str, delay: float, factor: float) -> Float[np.ndarray, "law load"]:
@@ -55,7 +55,7 @@ def losses(rig: str, delay: float, factor: float) -> Float[np.ndarray, "law load
 def main(arguments: list[str]) -> None:
     """Print a row for each plant, and the losses; write them for the page with `--pages`."""
     plants = list(itertools.product("BC", DELAYS, FACTORS))
-    rows, lost = [HEADER, ("---", *("---:",) * (len(HEADER) - 1))], []
+    rows, lost = [], []
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
         for plant, found in zip(plants, pool.map(losses, *zip(*plants, strict=True)), strict=True):
             rig, delay, factor = plant
@@ -66,7 +66,7 @@ def main(arguments: list[str]) -> None:
     worst, mean = 100 * np.max(lost, axis=0)
     print(f"the one law loses at most {worst:.1f} points at worst, {mean:.1f} in the mean")
     if "--pages" in arguments:
-        text = "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+        text = "\n".join(markdown_table(HEADER, rows, right_from=1))
         TABLE_FILE.write_text(text, encoding="utf-8")
 
 

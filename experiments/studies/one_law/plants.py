@@ -29,6 +29,7 @@ from experiments.studies.tuned_feedforward import drawn_table
 from experiments.thesis.cases import with_modes
 from jaxbeam import rigs
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.printer import markdown_table
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tuning.control.load_cases import AddressValues
 from tuning.control.objective import with_fixed_design
@@ -44,6 +45,7 @@ LAWS: dict[str, Callable[[str, jb.Case], jb.Case]] = {
 }
 FILTER_ERROR, DELAY_ERROR, RIGIDITY_ERROR = 0.05, PERIOD / 2, 0.1
 NO_GAIN = "worse than no control"
+SPANS = {"B": "one span", "C": "two spans"}
 
 
 def scheduled(case: jb.Case) -> jb.Case:
@@ -131,9 +133,7 @@ def rows(shares: Shares) -> list[tuple[str, ...]]:
 
 def main(arguments: list[str]) -> None:
     """Print the table, and write it for the page with `--pages`."""
-    spans = {"B": "one span", "C": "two spans"}
-    header = ("filter, delay", *(f"{law}, {spans[rig]}" for rig in "BC" for law in LAWS))
-    lines = [header, ("---", *("---:",) * (len(header) - 1)), *rows(Shares())]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    header = ("filter, delay", *(f"{law}, {SPANS[rig]}" for rig in "BC" for law in LAWS))
+    text = "\n".join(markdown_table(header, rows(Shares()), right_from=1))
     if "--pages" in arguments:
         TABLE_FILE.write_text(text, encoding="utf-8")

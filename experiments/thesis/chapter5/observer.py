@@ -84,7 +84,6 @@ def simulate_observed(
     case: jb.Case,
     period: float,
     gains: LoopGains | None,
-    noisy: bool = True,
     after_exit: float = 0.0,
 ) -> ObservedLoop:
     """Run of a case with one mass, until some time (s) after it has left.
@@ -98,10 +97,8 @@ def simulate_observed(
     crossing = float(case.beam.length / case.loads[0].speed)
     count = round((crossing + after_exit) / period)
     times = period * np.arange(count + 1)
-    noise = np.zeros((count + 1, len(C)))
-    if noisy:
-        deviations = np.sqrt(NOISE_VARIANCES)[: len(C)]
-        noise = deviations * np.random.default_rng(SEED).normal(size=noise.shape)
+    deviations = np.sqrt(NOISE_VARIANCES)[: len(C)]
+    noise = deviations * np.random.default_rng(SEED).normal(size=(count + 1, len(C)))
     force = dataclasses.replace(
         case, loads=(jb.MovingForce(mass=case.loads[0].mass, speed=case.loads[0].speed),)
     )

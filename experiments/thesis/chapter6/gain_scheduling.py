@@ -40,7 +40,6 @@ from jaxbeam.analysis.stability import stability_margin
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.feedback import Feedback, ScheduledFeedback
-from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.simulation.integration_plan import integration_plan
@@ -194,17 +193,14 @@ def equivalent_gains(
     )
 
 
-def best_gains(
-    case: Case, masses: ArrayLike, max_gain: float, margin: float | None = None
-) -> list[BestGain]:
+def best_gains(case: Case, masses: ArrayLike, max_gain: float) -> list[BestGain]:
     """Gain up to `max_gain` with the lowest peak of the run, for each mass (kg) of the first load.
 
     The case has a controller of kind "feedback", whose loops all have the same gain, in its units
     and with its power. TRIAL_GAINS gains are tried, then the best is refined between its
-    neighbours. With a `margin`, only gains with at least this gain margin under stationary loads
-    count (see `stability_margin`).
+    neighbours.
 
-    Raises ValueError for another controller, an invalid case, or if no gain has the margin.
+    Raises ValueError for another controller, or an invalid case.
     """
     controller = case.controller
     if type(controller) is not Feedback or controller.higher_gains is not None:
@@ -217,10 +213,7 @@ def best_gains(
     )
     best = []
     for mass in masses:
-        largest = (
-            max_gain if margin is None else _largest_gain_with_margin(case, mass, max_gain, margin)
-        )
-        gain, peak = _minimise_peak(lambda g, m=mass: _peak(_case_with(case, g, m), plan), largest)
+        gain, peak = _minimise_peak(lambda g, m=mass: _peak(_case_with(case, g, m), plan), max_gain)
         best.append(
             BestGain(
                 mass,
@@ -232,12 +225,7 @@ def best_gains(
     return best
 
 
-def scheduled_controller(
-    case: Case,
-    best: list[BestGain],
-    between: str = "interpolated",
-    load_identification: LoadIdentification | None = None,
-) -> ScheduledFeedback:
+def scheduled_controller(case: Case, best: list[BestGain]) -> ScheduledFeedback:
     """Scheduled controller with the gains of `best_gains`; other settings as those of the case.
 
     Raises ValueError if masses do not increase.
@@ -250,8 +238,6 @@ def scheduled_controller(
         masses=masses,
         gains=[[each.gain for each in best]] * len(case.driven),
         power=controller.power,
-        between=between,
-        load_identification=load_identification,
         period=controller.period,
         delay=controller.delay,
         resolution=controller.resolution,
@@ -289,26 +275,6 @@ def _minimise_peak(peak, max_gain: float) -> tuple[float, float]:
     if refined.fun < tried[best]:
         return float(np.exp(refined.x)), float(refined.fun)
     return float(gains[best]), tried[best]
-
-
-def _largest_gain_with_margin(case: Case, mass: float, max_gain: float, margin: float) -> float:
-    """Largest gain up to `max_gain` with a gain margin, to GAIN_TOLERANCE."""
-
-    def lacks_margin(gain):
-        return not stability_margin(_case_with(case, gain, mass)).gain >= margin
-
-    if not lacks_margin(max_gain):
-        return max_gain
-    low, high = MIN_GAIN_RATIO * max_gain, max_gain
-    if lacks_margin(low):
-        raise ValueError(
-            f"with a mass of {mass:g} kg the gain margin is below {margin:g} even for a gain of"
-            f" {low:g}; lower the margin or the largest gain"
-        )
-    while high / low > 1 + GAIN_TOLERANCE:
-        middle = np.sqrt(low * high)
-        low, high = (low, middle) if lacks_margin(middle) else (middle, high)
-    return float(low)
 
 
 HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law

@@ -33,7 +33,6 @@ from experiments.thesis.chapter6.gain_scheduling import (
 from experiments.thesis.verdicts import LITERAL, STATEMENT, assign_verdicts
 from jaxbeam import rigs
 from jaxbeam.case.validation import check_case
-from tests.analysis.test_compare import critical_gain
 from tests.control.test_feedback import beam_case, gains_at, law
 from tests.loop_as_oracle import expected
 
@@ -75,19 +74,9 @@ def test_best_gain_has_the_lowest_peak_by_the_oracle(loop):
         assert found.peak < 0.95 * found.uncontrolled
         for other in (0.85, 1.18):
             assert peak(other * found.gain, found.mass) > lowest
-    made = scheduled_controller(loop, [light, heavy], "stepped")
-    assert_allclose(gains_at(made, loop, 0.1), [light.gain], rtol=1e-12)
+    made = scheduled_controller(loop, [light, heavy])
+    assert_allclose(gains_at(made, loop, 0.05), [light.gain], rtol=1e-12)
     check_case(dataclasses.replace(loop, controller=made))
-
-
-def test_best_gain_with_a_margin(loop):
-    """Against the critical gain with the mass at rest, by scipy."""
-    case = jb.replace(loop, {"loads.0.mass": 0.509})
-    (found,) = best_gains(case, [0.509], 1e4, margin=2.0)
-    critical = min(critical_gain(case, x) for x in np.linspace(0, 0.6, 13))
-    assert found.gain <= critical / 2 * (1 + 1e-6)
-    with pytest.raises(ValueError, match="the gain margin is below 1e"):
-        best_gains(case, [0.509], 1e4, margin=1e6)
 
 
 def test_other_controllers_are_refused():

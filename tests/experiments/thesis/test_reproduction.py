@@ -29,7 +29,6 @@ from experiments.thesis.verdicts import (
     PublishedNumbers,
     Tolerance,
     assign_verdicts,
-    likeliest_reading,
     make_finding,
     readings_of,
 )
@@ -164,7 +163,7 @@ def test_experiments_in_two_processes(tmp_path):
 # Verdicts on published numbers: tolerances, null models, fitted and repeated numbers, readings.
 
 RELATIVE = Tolerance("for a test", relative=0.1)
-TWO = PublishedNumbers("here", "two numbers", "m", "computed", RELATIVE, "1.0 20", "a b")
+TWO = PublishedNumbers("here", "two numbers", "m", "1.0 20", "a b", tolerance=RELATIVE)
 FAR = ("nothing", 0.0)
 
 
@@ -200,7 +199,7 @@ def test_what_the_null_model_meets_counts_for_nothing():
 
 
 def test_a_yes_or_a_no_counts_for_nothing():
-    published = PublishedNumbers("here", "", "", "computed", YES_OR_NO, "1 0", "a b")
+    published = PublishedNumbers("here", "", "", "1 0", "a b", tolerance=YES_OR_NO)
     one = make_finding(published, [1.0, 1.0], null=FAR)
     assert verdicts(one) == [[STATEMENT, STATEMENT]]
     assert one.misfit(frozenset()) == 0.0
@@ -219,7 +218,7 @@ def test_a_number_that_a_parameter_was_fitted_to_counts_for_nothing():
 
 def test_numbers_that_repeat_others_count_for_nothing():
     published = PublishedNumbers(
-        "here", "", "", "computed", RELATIVE, "1.0 20", "a b", repeats="there", repeated_labels="a"
+        "here", "", "", "1.0 20", "a b", tolerance=RELATIVE, repeats="there", repeated_labels="a"
     )
     one = make_finding(published, [1.0, 20.0], null=FAR)
     assert verdicts(one) == [[REPEATED, REPRODUCED]]
@@ -230,7 +229,7 @@ def test_one_interpretation_serves_for_all_numbers():
     """The likeliest is taken, for hits and for misses; nothing is picked from the others."""
     first = make_finding(TWO, [1, 0], {"p": [0.0, 20.0], "q": [0.0, 0.0]}, null=FAR)
     second = make_finding(TWO, [0, 0], {"p": [1.0, 0.0], "q": [1.0, 0.0]}, null=FAR)
-    assert likeliest_reading([first, second]) == {"p"}
+    assert assign_verdicts([first, second])[0].reading == {"p"}
     assert verdicts(first, second) == [[NOT_REPRODUCED, EXPLAINED], [EXPLAINED, NOT_REPRODUCED]]
 
 
@@ -248,7 +247,7 @@ def test_one_reading_serves_for_all_findings_of_a_rig():
     assert set(readings_of([first, second])) == {
         frozenset(one) for one in ((), ("p",), ("q",), ("q", "r"))
     }
-    assert likeliest_reading([first, second]) == {"q", "r"}
+    assert assign_verdicts([first, second])[0].reading == {"q", "r"}
     assert verdicts(first, second, third) == [
         [EXPLAINED, NOT_REPRODUCED],
         [EXPLAINED, EXPLAINED],
@@ -260,12 +259,12 @@ def test_questions_that_other_findings_ask_are_answered_apart():
     first = make_finding(TWO, [5, 5], {"p": [1.0, 20.0]}, null=FAR)
     second = make_finding(TWO, [5, 5], {"q": [1.0, 20.0]}, null=FAR)
     assert len(readings_of([first, second])) == 4
-    assert likeliest_reading([first, second]) == {"p", "q"}
+    assert assign_verdicts([first, second])[0].reading == {"p", "q"}
 
 
 def test_parameters_that_explain_no_more_than_themselves_do_not_make_an_interpretation_likelier():
     near = make_finding(TWO, [1.05, 20.0], {"p": [1.0, 20.0]}, null=FAR, fitted={"p": "a"})
-    assert likeliest_reading([near]) == frozenset()
+    assert assign_verdicts([near])[0].reading == frozenset()
 
 
 @pytest.mark.parametrize(
@@ -278,7 +277,7 @@ def test_parameters_that_explain_no_more_than_themselves_do_not_make_an_interpre
     ],
 )
 def test_tolerances(tolerance, values, allowed):
-    printed = PublishedNumbers("", "", "", "", tolerance, values)
+    printed = PublishedNumbers("", "", "", values, origin="", tolerance=tolerance)
     np.testing.assert_allclose(printed.allowed_error, allowed)
 
 
