@@ -16,7 +16,7 @@ import shutil
 import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +67,10 @@ def check_named(path: str | os.PathLike) -> None:
 
 
 @contextlib.contextmanager
-def naming_file(path: str | os.PathLike, kept: str = "") -> Iterator[None]:
+def naming_file(path: str | os.PathLike, kept: Callable[[], str] = str) -> Iterator[None]:
     """Replace errors of the system in writing by one sentence with the name that the user gave.
 
-    `kept` says what is there all the same, and how to go on. Raises OSError of the same class.
+    `kept()` says what is there all the same, and how to go on. Raises OSError of the same class.
     """
     try:
         yield
@@ -79,7 +79,7 @@ def naming_file(path: str | os.PathLike, kept: str = "") -> Iterator[None]:
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error.strerror or str(error)
         kind = type(error) if type(error).__module__ == "builtins" else OSError
-        named = kind(f"cannot write {os.fspath(path)}: {reason[:1].lower()}{reason[1:]}{kept}")
+        named = kind(f"cannot write {os.fspath(path)}: {reason[:1].lower()}{reason[1:]}{kept()}")
         named.errno = error.errno
         raise named from None
 

@@ -62,24 +62,24 @@ def compute_blocks(
     bundles = [blocks[i : i + size] for i in range(0, len(blocks), size)]
     futures = client.map(compute_and_store, bundles, fingerprint=fingerprint, path=path, pure=False)
     try:
-        for future in _completed(client, futures):
+        for future in _completed(client, futures, path):
             yield from future.result()
     except CancelledError:
         raise RuntimeError(
-            "the connection to the scheduler of the cluster is lost; finished blocks are kept:"
-            " start it, then resume"
+            "the connection to the scheduler of the cluster is lost;"
+            f" {store.kept_blocks(path)}: start it, then resume"
         ) from None
     except KilledWorker:
         raise RuntimeError(
-            "workers keep dying (too little memory for each?); finished blocks are kept:"
-            " mend this, then resume"
+            "workers keep dying (too little memory for each?);"
+            f" {store.kept_blocks(path)}: mend this, then resume"
         ) from None
     finally:
         with contextlib.suppress(CancelledError, OSError, TimeoutError):
             client.cancel(futures)
 
 
-def _completed(client: "distributed.Client", futures: list) -> Iterator:
+def _completed(client: "distributed.Client", futures: list, path: Path) -> Iterator:
     """Futures as they end. Raises RuntimeError when no worker has been there for LONELY seconds."""
     from distributed import as_completed
 
@@ -97,8 +97,8 @@ def _completed(client: "distributed.Client", futures: list) -> Iterator:
                 last_seen = time.monotonic()  # without a scheduler the futures are cancelled
             elif now - last_seen > LONELY:
                 raise RuntimeError(
-                    f"the cluster has had no workers for {LONELY:.0f} s; finished blocks are kept:"
-                    " start some, then resume"
+                    f"the cluster has had no workers for {LONELY:.0f} s;"
+                    f" {store.kept_blocks(path)}: start some, then resume"
                 )
 
 

@@ -124,10 +124,19 @@ def explaining_damage(path: Path):
         ) from None
 
 
+def kept_blocks(path: Path) -> str:
+    """Clause on the finished blocks of a store at a path; that there are none, if so."""
+    blocks = path / BLOCKS_GROUP
+    some = any(next(block_places(file), None) for file in blocks.rglob(f"*{BLOCK_FILES}"))
+    parts = (found.parent for found in blocks.glob("*/zarr.json"))  # of words, when complete
+    some = some or any(not {"steps", BLOCKS_GROUP} & set(os.listdir(part)) for part in parts)
+    return "finished blocks are kept" if some else "no block has finished"
+
+
 @contextlib.contextmanager
 def explaining_write_errors(path: Path):
-    """Replace errors in writing; raises OSError that says that finished blocks are kept."""
-    with naming_file(path, "; finished blocks are kept: mend this, then resume"):
+    """Replace errors in writing; raises OSError that says whether finished blocks are kept."""
+    with naming_file(path, lambda: f"; {kept_blocks(path)}: mend this, then resume"):
         yield
 
 

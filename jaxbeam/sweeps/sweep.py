@@ -17,7 +17,7 @@ from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.quality import warn_of_failures, warn_of_strokes, warn_of_truncation
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.sweeps.store import read_dataset, writing
+from jaxbeam.sweeps.store import kept_blocks, read_dataset, writing
 from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def sweep(
             def kept() -> str:
                 again = "the same command goes on" if overwrite else "resume it, with --resume"
                 unfinished = (place.folder / "zarr.json").exists()
-                return f"finished blocks are kept in {path}: {again}" if unfinished else ""
+                return f"{kept_blocks(place.folder)} in {path}: {again}" if unfinished else ""
 
             with keeping(kept):
                 return computed(*place)

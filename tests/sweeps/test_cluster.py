@@ -147,7 +147,7 @@ def stuck(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("lost", "message"),
     [
-        ("workers", "has had no workers for 0 s; finished"),
+        ("workers", "has had no workers for 0 s; no block has finished"),
         ("scheduler", "the scheduler .* is lost"),
     ],
 )

@@ -16,7 +16,13 @@ import xarray
 import jaxbeam as jb
 from jaxbeam.simulation.stored_record import read_record
 from jaxbeam.sweeps.specification import SweepSpecification
-from jaxbeam.sweeps.store import ZarrStore, append_block, block_places, read_block
+from jaxbeam.sweeps.store import (
+    ZarrStore,
+    append_block,
+    block_places,
+    kept_blocks,
+    read_block,
+)
 from tests.modules import module_files, parse
 from tests.sweeps.test_sweep import CASE
 from tuning import read_logs
@@ -198,6 +204,13 @@ def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
     assert ZarrStore(path).missing(range(3)) == [2]
     xarray.testing.assert_identical(sweep(path, resume=True), complete[1])
     assert not list(path.rglob("*.partial"))
+
+
+def test_finished_blocks_are_said_to_be_kept_where_there_are_some(unfinished, tmp_path):
+    """It was said where none had finished, too."""
+    stop_after(0, tmp_path / "runs.zarr")
+    assert kept_blocks(tmp_path / "runs.zarr") == "no block has finished"
+    assert kept_blocks(unfinished) == "finished blocks are kept"
 
 
 def test_folder_that_is_not_writable_is_named_before_any_run(tmp_path, monkeypatch):

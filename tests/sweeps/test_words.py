@@ -16,7 +16,7 @@ from jaxbeam.case.loads.vehicles import VehicleLoad
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.load_set import load_set
 from jaxbeam.sweeps import integration
-from jaxbeam.sweeps.store import ZarrStore, status
+from jaxbeam.sweeps.store import ZarrStore, kept_blocks, status
 from jaxbeam.sweeps.words import with_numbers
 
 BEAM = jb.Beam(25.0, 3.0e10, 15000.0, damping_ratio=0.01, modes=1)
@@ -129,6 +129,7 @@ def test_store_is_resumed_after_an_interrupt(tmp_path, monkeypatch, dataset):
         with pytest.raises(KeyboardInterrupt):
             sweep(store=path)
     assert status(path)[0] == "unfinished" and status(path / "blocks" / "0")[0] == "complete"
+    assert kept_blocks(path) == "finished blocks are kept"
     with pytest.raises(FileExistsError, match="resume it"):
         sweep(store=path)
     with pytest.raises(ValueError, match="another case, other values"):
