@@ -6,7 +6,6 @@ stuck, late and coarse, or the beam is softer. Commands oscillate where they hav
 beyond those of the uncontrolled deflection.
 """
 
-import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -139,7 +138,7 @@ class Comparison(TableViews, Module):
     `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.
     Both of the bound are None where limits of a voltage allow none (see `jaxbeam.bound`).
     `damper_peaks` are the peaks that dampers of the semi-active controllers attain with rates known
-    in advance, where any are found.
+    in advance, or sentences that say why none is found.
     """
 
     case: Case
@@ -148,7 +147,7 @@ class Comparison(TableViews, Module):
     records: dict[str, Record]
     metrics: dict[str, PerformanceMetrics]
     bound: Bound | None
-    damper_peaks: dict[str, DamperPeak]
+    damper_peaks: dict[str, DamperPeak | str]
 
     @property
     def headline(self) -> str:
@@ -197,9 +196,9 @@ class Comparison(TableViews, Module):
 
     def damper_summary(self, name: str) -> str:
         """Sentence on what the dampers of a semi-active controller attain; empty for others."""
-        if name not in self.damper_peaks:
-            return ""
-        best, peak = self.damper_peaks[name], self.metrics[name].peak
+        best, peak = self.damper_peaks.get(name, ""), self.metrics[name].peak
+        if isinstance(best, str):
+            return best and f"no peak that its dampers attain: {best}"
         attainable = best.uncontrolled - best.peak
         if not attainable > 0 or np.isnan(peak):  # dampers of no effect, or a run that diverges
             return best.verdict
@@ -272,8 +271,10 @@ def compare(
     damper_peaks = {}
     for name, one in controllers.items():
         if isinstance(one, SemiActive):
-            with contextlib.suppress(ValueError):  # no forces found
+            try:
                 damper_peaks[name] = damper_peak(dataclasses.replace(case, controller=one))
+            except ValueError as error:
+                damper_peaks[name] = str(error)
     return Comparison(
         uncontrolled_case, uncontrolled, optimal, records, metrics, least_peak, damper_peaks
     )

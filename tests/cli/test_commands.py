@@ -275,6 +275,7 @@ COMPARISON = {
             "limit_cycles": LIMIT_CYCLES,
             "swings": LIMIT_CYCLES,
             "damper_peak": None,
+            "dampers": None,
             "loop": None,
             "verdict": None,
         }

@@ -80,7 +80,7 @@ def damper_peak(case: Case, positions: ArrayLike | None = None) -> DamperPeak:
     or longer where a run has more than MAX_HOLDS of them.
 
     Raises ValueError for another controller, if no forces are found, as where limits of actuators
-    are below those of the smallest rates, and as `bound`.
+    are below the forces of the smallest rates, and as `bound`.
 
     >>> import jaxbeam as jb
     >>> from jaxbeam.analysis.bound.dampers import damper_peak
@@ -126,8 +126,8 @@ def damper_peak(case: Case, positions: ArrayLike | None = None) -> DamperPeak:
     peak, forces = min(filter(None, found), key=lambda one: one[0], default=(None, None))
     if peak is None:
         raise ValueError(
-            "no forces of the dampers were found: are limits of the actuators below those of the"
-            " smallest rates?"
+            "no forces of the dampers were found within the limits of the actuators: raise the"
+            " limits, or lower min_damping"
         )
     without = float(np.abs(influence.deflection(np.zeros_like(forces))).max())
     return DamperPeak(peak, without, influence.hold_times, forces, period)

@@ -209,7 +209,8 @@ def _to_dict(comparison: "Comparison") -> dict:
         "controllers": {
             name: _metrics_to_dict(metrics)
             | {
-                "damper_peak": best.peak if (best := comparison.damper_peaks.get(name)) else None,
+                "damper_peak": getattr(comparison.damper_peaks.get(name), "peak", None),
+                "dampers": comparison.damper_summary(name),
                 "loop": comparison.loop_summary(name),
                 "verdict": comparison.records[name].verdict,
             }

@@ -97,6 +97,16 @@ def test_a_comparison_says_what_the_dampers_attain():
     assert_allclose(constant.peak, found.metrics["constant"].peak, rtol=1e-3)
 
 
+def test_a_comparison_says_why_no_peak_of_dampers_is_found():
+    """It left them out without a word. At 1 cm/s the smallest rate takes a thousand times 8 N."""
+    weak = [jb.PointForce(DAMPER, limits=[-8.0, 8.0])]
+    case = dataclasses.replace(CASE, controller=None, actuators=weak)
+    stiff = dataclasses.replace(CASE.controller, min_damping=8e5)
+    found = compare(case, {"stiff": stiff})
+    assert found.damper_peaks["stiff"].endswith("raise the limits, or lower min_damping")
+    assert "stiff: no peak that its dampers attain: no forces" in " ".join(found.remarks)
+
+
 def test_long_runs_have_longer_holds_and_other_laws_are_refused():
     law = dataclasses.replace(CASE.controller, period=0.002)
     found = damper_peak(dataclasses.replace(CASE, controller=law))
