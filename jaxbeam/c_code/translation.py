@@ -257,7 +257,8 @@ def _plain(function: str) -> str:
 
 
 def in_single_type(text: str) -> str:
-    """Text of translated lines with the types of a program: `real` and `int`."""
+    """Text of translated lines with the types of a program: `real` and `int`, not float."""
+    text = re.sub(r"\b(NAN|INFINITY)\b", r"(real)\1", text)  # which are float in C
     for word, own in (("double", "real"), ("int64_t", "int"), ("INT64_", "INT_")):
         text = re.sub(rf"\b{word}\b" if word != "INT64_" else word, own, text)
     return text

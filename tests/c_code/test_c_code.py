@@ -80,7 +80,7 @@ def test_operations_at_worst_are_stated(kind, tmp_path):
         assert counted >= MIN_OPERATIONS_SHARE * program.operations
 
 
-CONVERSIONS = ["-Wconversion", "-Wsign-conversion", "-Wshadow"]
+CONVERSIONS = ["-Wconversion", "-Wsign-conversion", "-Wshadow", "-Wdouble-promotion"]
 FORBIDDEN = (
     r"\b(goto|while|do|malloc|calloc|realloc|free|va_list|setjmp|longjmp)\b|\(\s*\*\s*\w+\s*\)\s*\("
 )
