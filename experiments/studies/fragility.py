@@ -142,7 +142,7 @@ def shares_of(by_law: Mapping[str, jb.Case]) -> dict[str, float]:
 
 def false_alarm_remarks(case: jb.Case) -> list[str]:
     """Lift of the beam by gates that fire without a load, with and without confirmation."""
-    by_law = laws(jb.replace(standard_case(case), {"loads.0.mass": 1e-9}))
+    by_law = laws(jb.replace(standard_case(case), {"loads.0.mass": 0.0}))
     lift = {
         name: 1e3 * float(np.max(jb.simulate(by_law[name], tolerance=TOLERANCE).deflection))
         for name in (HAND_SET, BENCH, CONFIRMED)

@@ -142,6 +142,14 @@ def test_a_misplaced_gate_makes_the_load_seem_faster_or_slower(error):
         np.testing.assert_allclose(step.command, [expected], atol=1e-9)
 
 
+def test_gates_that_fire_without_a_load_are_no_implausible_case():
+    """A load of 1e-9 kg, in its place, was said to be in t, and the patch to be too strong."""
+    case = jb.replace(fragility.standard_case(rigs.load("B")), {"loads.0.mass": 0.0})
+    assert not jb.check(fragility.laws(case)[fragility.HAND_SET]).warnings
+    (remark,) = fragility.false_alarm_remarks(rigs.load("B"))
+    assert "mm" in remark
+
+
 def test_a_softer_plant_keeps_the_design_of_the_law():
     by_law = fragility.laws(fragility.standard_case(rigs.load("B")))
     case = by_law[fragility.SENSORS_ONLY]
