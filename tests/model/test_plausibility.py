@@ -41,6 +41,17 @@ def test_rigs_and_examples_are_plausible(path: Path):
     assert jb.check(jb.load_case(path)).warnings == ()
 
 
+def test_a_weight_for_a_mass_per_length_is_noticed():
+    """15 t/m given as N/m: the bridge sags by 5 w L^4 / (384 E I), and no row said so."""
+    weight = BRIDGE["mass_per_length"] * 9.81
+    sag = 5 * weight * 9.81 * 25.0**4 / (384 * BRIDGE["flexural_rigidity"])
+    assert 10 < 25.0 / sag < 120
+    (sentence,) = jb.check(bridge({"mass_per_length": weight})).warnings
+    assert f"sags by {sag:.2f}" in sentence and "not a weight in N" in sentence
+    on_springs = [jb.Support(12.5, stiffness=1e8)]
+    assert jb.check(bridge({"mass_per_length": weight}, on_springs)).warnings == ()
+
+
 def test_the_demonstration_is_plausible():
     case = jb.load_case(ROOT / "jaxbeam/demo/rig.toml")
     assert jb.check(case).warnings == ()

@@ -16,6 +16,7 @@ from jaxbeam.model.state_space import poles
 
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500
+LEAST_DECK = 100.0  # kg/m: beams of less are no decks, but of unit mass
 CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
 
 
@@ -89,7 +90,7 @@ def _sag(facts, sag):
     if sag:
         address, words = limp_stiffness(facts)
         span = facts.numbers.span
-        size = f"1/{span / sag:.2g} of its span of {span:.4g} m"
+        size = f"1/{float(f'{span / sag:.2g}'):g} of its span of {span:.4g} m"
         size = "more than its length" if sag > facts.length else size
         words |= {"sag": sag, "size": size, "stiffness": address}
         yield Value(address, span / sag, words)
@@ -118,6 +119,22 @@ def heaviest_load(facts) -> str:
 def sag_of_beam(facts):
     """Span over the static deflection under the beam's own weight."""
     return _sag(facts, facts.numbers.own_deflection)
+
+
+def sag_of_bridge(facts):
+    """The same of bridges, whose deck yields where it sags far.
+
+    The stress of steel at a distance c from the neutral axis is (48/5) E sag c / span^2: with
+    span / c = 50 it is 200 MPa at a sag of span/190.
+    """
+    if facts.is_bridge and facts.density > LEAST_DECK and not list(_soft(facts)):
+        yield from sag_of_beam(facts)
+
+
+def _soft(facts) -> Iterator[Any]:
+    """What may bear the weight of the beam before it is stiff: springs, foundations."""
+    yield from (name for _, stiffness, name in facts.held() if stiffness < INF)
+    yield from (k for _, k in numbers_of(facts.case.beam, "beam", "foundation_stiffness") if k)
 
 
 def first_frequency(facts):
