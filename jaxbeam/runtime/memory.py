@@ -1,10 +1,7 @@
-"""Free memory, memory of the blocks of a computation, and rare garbage collection."""
+"""Free memory, memory of the blocks of a computation, and results that are kept in memory."""
 
-import contextlib
-import gc
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 DEFAULT_PART = 4  # blocks take a quarter of what is free: other programs need some, too
@@ -12,8 +9,6 @@ UNKNOWN = 2 * 2**30  # bytes, assumed on a machine that does not report free mem
 UNITS = {"": 1.0, "B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 UNITS |= {"KiB": 2.0**10, "MiB": 2.0**20, "GiB": 2.0**30, "TiB": 2.0**40}
 GROUPS = Path("/sys/fs/cgroup")  # of control groups, by which containers limit memory
-# Of new objects, and of younger collections for an older one. JAX alone has 400 000 objects.
-RARELY = (500_000, 20, 100)
 
 
 def block_memory(given: float | str | None = None) -> float:
@@ -87,19 +82,3 @@ def _of_process() -> float | None:
         return float(limit - pages * os.sysconf("SC_PAGE_SIZE"))
     except (ImportError, OSError, ValueError):
         return None
-
-
-@contextlib.contextmanager
-def rare_collections() -> Iterator[None]:
-    """Context in which Python's garbage collector runs rarely.
-
-    Imports and tracing make a million objects and hardly any garbage: the first sweep of a process
-    takes 0.15 s less of 1.4 s.
-    """
-    former = gc.get_threshold()
-    gc.set_threshold(*RARELY)
-    try:
-        yield
-    finally:
-        if former != RARELY:  # otherwise another thread, or the command line, restores it
-            gc.set_threshold(*former)

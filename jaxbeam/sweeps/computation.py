@@ -18,7 +18,7 @@ from jaxbeam.case.case import Case, address_words, unit_at
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse
-from jaxbeam.runtime.memory import rare_collections, size_text
+from jaxbeam.runtime.memory import size_text
 from jaxbeam.runtime.printer import labelled_dataset
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
@@ -109,7 +109,7 @@ def _new_runner(specification: SweepSpecification) -> tuple[AnyRunner, bool]:
     steps are taken without it if that fails.
     """
     if specification.uses_c():
-        with rare_collections(), native_peaks.LIBRARY.built_meanwhile():
+        with native_peaks.LIBRARY.built_meanwhile():
             runner = specification.runner(native=True)
         if native_peaks.available():
             return runner, True

@@ -1,19 +1,12 @@
-"""Memory that is free, the part of it that blocks take, and rare collections of garbage."""
+"""Memory that is free, and the part of it that blocks take."""
 
-import gc
 import subprocess
 import sys
 
 import pytest
 
 from jaxbeam.runtime import memory
-from jaxbeam.runtime.memory import (
-    RARELY,
-    block_memory,
-    free_memory,
-    rare_collections,
-    size_text,
-)
+from jaxbeam.runtime.memory import block_memory, free_memory, size_text
 
 
 @pytest.mark.parametrize(
@@ -54,24 +47,3 @@ def test_limits_of_the_process():
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     free, taken = map(float, found.stdout.split())
     assert free < 8 * 2**30 and taken > 2**26
-
-
-def test_thresholds_are_restored():
-    former = gc.get_threshold()
-    with rare_collections():
-        assert gc.get_threshold() == RARELY
-    assert gc.get_threshold() == former
-    with pytest.raises(ZeroDivisionError), rare_collections():
-        raise ZeroDivisionError
-    assert gc.get_threshold() == former
-
-
-def test_thresholds_are_restored_after_two_threads():
-    """The second begins within the first, and ends after it."""
-    former = gc.get_threshold()
-    first, second = rare_collections(), rare_collections()
-    for context in (first, second):
-        context.__enter__()
-    for context in (first, second):
-        context.__exit__(None, None, None)
-    assert gc.get_threshold() == former
