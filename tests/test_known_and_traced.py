@@ -22,7 +22,7 @@ from jaxbeam.case.sensors import QUANTITIES, Filter
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
-from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.deflection_lines import static_deflection_per_command

@@ -23,8 +23,8 @@ from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import step_inputs
 from jaxbeam.integrator.load_path import load_path
 from jaxbeam.integrator.propagators import NODE_COUNT
-from jaxbeam.integrator.static_shapes import StaticShapes
 from jaxbeam.integrator.step import AffineMap, step_maps
+from jaxbeam.integrator.step_size import StaticShapes
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule
 from jaxbeam.integrator.vehicles import vehicles_of
 from jaxbeam.model.contact import initial_vehicle_states

@@ -305,7 +305,7 @@ def enable_compile_cache() -> None:
 
     Imports JAX (half a second), so that commands call it after their checks.
     """
-    from jaxbeam.runtime.compile_cache import switch_on
+    from jaxbeam.runtime.cache_folder import switch_on
 
     switch_on()
 

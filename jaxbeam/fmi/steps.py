@@ -13,7 +13,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.estimation.sampled_plant import SampleTiming
-from jaxbeam.integrator.kinks import may_have_kinks
+from jaxbeam.model.contact import may_have_kinks
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensor_signals import (
     MAX_READING,

@@ -18,10 +18,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.contact_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.discrete_model import DiscreteModel, energies
-from jaxbeam.integrator.growth import (
+from jaxbeam.integrator.inputs import (
     OVERFLOW,
+    AbstractInputPolicy,
+    StepInfo,
     amplitudes,
     diverged,
     growth_limit,
@@ -29,8 +30,7 @@ from jaxbeam.integrator.growth import (
     has_feedback,
     largest_by_marks,
 )
-from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
-from jaxbeam.integrator.load_path import LoadPath, load_path
+from jaxbeam.integrator.load_path import END_FRACTIONS, LoadPath, end_forces, load_path
 from jaxbeam.integrator.peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.step import advance_free, advance_unforced, step_maps

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.integrator.contact_forces import END_FRACTIONS
+from jaxbeam.integrator.load_path import END_FRACTIONS
 from jaxbeam.integrator.propagators import (
     GAUSS_NODES,
     NODE_COUNT,

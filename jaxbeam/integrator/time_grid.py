@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.kinks import KinkPassages, kink_passages
+from jaxbeam.model.contact import KinkPassages, kink_passages
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (

@@ -3,9 +3,16 @@
 A library of the cache is named by a hash of its source, its compiler flags and the machine; one of
 a wheel (`hatch_build.py`) by a hash of the source and its architecture. Everything also runs
 without them.
+
+No other file makes code that runs of bytes: no module of the repository unpickles, evaluates or
+executes what it reads, and no other loads a library (a test of the store goes through the source
+of all). What is loaded runs with the rights of the user. It comes from the cache folder, after
+`cache_folder.read_file` has verified its owner, its mode and its HMAC, or is a library that was
+installed with the package, as its Python code was.
 """
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import logging
@@ -27,9 +34,27 @@ from jaxbeam.runtime.cache_folder import (
     machine_description,
     private_folder,
     read_file,
+    temporary_file,
     write_file,
 )
-from jaxbeam.runtime.trusted_code import NativeCode, library_of_wheel, loaded_library
+
+NativeCode = ctypes.CDLL  # whose attributes are its functions
+
+
+def loaded_library(name: str) -> NativeCode:
+    """C library in a file of the cache folder.
+
+    The bytes that were verified are loaded, from a file of this process. Raises CacheError if
+    others may have written it or it is damaged, OSError if it is missing or no library.
+    """
+    with temporary_file(private_folder(), read_file(name) or b"") as path:
+        return ctypes.CDLL(path)
+
+
+def library_of_wheel(path: pathlib.Path) -> NativeCode:
+    """C library in the installed package. Raises OSError if it cannot be loaded here."""
+    return ctypes.CDLL(str(path))
+
 
 LOGGER = logging.getLogger(__name__)
 C_FOLDER = pathlib.Path(__file__).parent / "native"

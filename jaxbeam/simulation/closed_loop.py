@@ -19,8 +19,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.fields import concrete
-from jaxbeam.integrator.growth import load_amplitude
-from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo, load_amplitude
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.integrator.time_grid import (
     EventSchedule,

@@ -25,20 +25,22 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.inputs import AbstractInputPolicy, HeldCommands
 from jaxbeam.integrator.integrate import integrate_at_events
-from jaxbeam.integrator.static_shapes import StaticShapes, model_limits, static_shapes
 from jaxbeam.integrator.step_size import (
     CONVERGENCE_ORDER,
     MAX_DIVERGED_HALVINGS,
     NO_STEP,
     UNSAMPLED,
     ErrorFloor,
+    StaticShapes,
     StepTrial,
     check_step_count,
     check_tolerance,
     choose_step_size,
     largest_change,
     longest_trial_step,
+    model_limits,
     rounding_deflection,
+    static_shapes,
     steps_per_interval,
 )
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule

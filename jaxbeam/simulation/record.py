@@ -234,7 +234,7 @@ class Record(RecordViews):
     are those of the first flight, and `flights` are all of them, else None. `command` is that of
     the actuators, within their limits; at a change, the one just after. `failures` counts the steps
     of the controller so far without a solution of its optimisation. If the closed loop diverges,
-    which its growth shows (see `jaxbeam.integrator.growth`), the samples are NaN from then on, and
+    which its growth shows (see `jaxbeam.integrator.inputs`), the samples are NaN from then on, and
     so are the peaks. `error_estimate`, of steps and peaks, is relative to the largest deflection,
     `step_errors` to the largest value of what each sensor measures; both have no derivatives, which
     `grad` refuses and `jvp` gives as NaN. `controller_readings` are the readings that a sampled

@@ -22,11 +22,6 @@ from jaxbeam.case.contact import UnilateralContact
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.contact_forces import (
-    FORCE_FRACTIONS,
-    contact_minimum,
-    force_weights_at_fractions,
-)
 from jaxbeam.integrator.lifting_steps import (
     INSIDE,
     NODE_COUNT,
@@ -41,7 +36,14 @@ from jaxbeam.integrator.lifting_steps import (
     instants,
     prepare,
 )
-from jaxbeam.integrator.peaks import RunningPeaks, initial_peaks, peaks_of_steps
+from jaxbeam.integrator.peaks import (
+    FORCE_FRACTIONS,
+    RunningPeaks,
+    contact_minimum,
+    force_weights_at_fractions,
+    initial_peaks,
+    peaks_of_steps,
+)
 from jaxbeam.integrator.step_size import UNSAMPLED, rounding_deflection, trial_positions
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import ContactState, initial_vehicle_states, split_states

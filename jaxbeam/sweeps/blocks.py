@@ -22,7 +22,7 @@ from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.profiles.spectra import AbstractSpectralProfile
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.integrate import max_stable_step
-from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
+from jaxbeam.integrator.step_size import StaticShapes, max_concurrent_loads
 from jaxbeam.integrator.time_grid import sample_schedule
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling

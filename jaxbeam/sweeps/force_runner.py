@@ -41,7 +41,7 @@ from jaxbeam.model.output_rows import (
     static_correction,
 )
 from jaxbeam.model.static_correction import is_supported
-from jaxbeam.runtime.remembering import remembered_within
+from jaxbeam.runtime.memory import remembered_within
 from jaxbeam.sweeps.batches import Batches, values_at
 from jaxbeam.sweeps.step_size import (
     REFINEMENT,

@@ -30,7 +30,7 @@ from jaxbeam.integrator.integrate import (
     integrate_peaks,
     max_stable_step,
 )
-from jaxbeam.integrator.static_shapes import StaticShapes
+from jaxbeam.integrator.step_size import StaticShapes
 from jaxbeam.integrator.time_grid import (
     EventSchedule,
     LoadEvents,

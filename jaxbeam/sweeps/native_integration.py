@@ -24,8 +24,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.case.case import Case, concrete_case, structure_of
 from jaxbeam.case.profiles.spectra import profiles_of_runs
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.growth import growth_limit, load_amplitude
-from jaxbeam.integrator.inputs import StepInfo
+from jaxbeam.integrator.inputs import StepInfo, growth_limit, load_amplitude
 from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.time_grid import (
     EventSchedule,
@@ -49,8 +48,8 @@ from jaxbeam.runtime.c_writer import (
     used_variables,
     without_unused,
 )
+from jaxbeam.runtime.memory import remembered
 from jaxbeam.runtime.native_library import Library
-from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import LoopMemory, SampledLoop, closed_loop
 from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, evenly_spaced, values_at, with_few_runs

@@ -11,15 +11,20 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case, replace, structure_of
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.integrator.static_shapes import longest_stable_step, max_concurrent_loads
-from jaxbeam.integrator.step_size import check_step_count, trial_run, without_later_vibration
+from jaxbeam.integrator.step_size import (
+    check_step_count,
+    longest_stable_step,
+    max_concurrent_loads,
+    trial_run,
+    without_later_vibration,
+)
 from jaxbeam.model.deflection_lines import unchecked_influence_line
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, modal_influence_line
 from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.remembering import remembered
+from jaxbeam.runtime.memory import remembered
 from jaxbeam.simulation.errors import truncation_changes
 from jaxbeam.simulation.section_forces import motion_at, motion_of_forces
 

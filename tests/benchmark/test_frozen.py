@@ -18,7 +18,7 @@ import jaxbeam as jb
 from jaxbeam.benchmark import scoring
 from jaxbeam.benchmark.problem import TEST_SEEDS, VERSION, load, names
 from jaxbeam.benchmark.scoring import attainable, compute_attainable, published
-from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.simulation.commands import command_ranges
 from tests.modules import ROOT
 

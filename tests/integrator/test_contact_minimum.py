@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.contact_forces import contact_minimum
+from jaxbeam.integrator.peaks import contact_minimum
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations

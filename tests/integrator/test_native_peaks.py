@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.integrator import contact_forces, native_peaks, peaks, propagators, step_matrices
+from jaxbeam.integrator import native_peaks, peaks, propagators, step_matrices
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.numerics import polynomials
 from jaxbeam.numerics.polynomials import interpolation_matrix, refine_peak
@@ -253,10 +253,10 @@ def test_constants_are_those_of_the_c_code():
         "TAYLOR_TERMS": propagators.TAYLOR_TERMS,
         "DOUBLINGS": propagators.DOUBLINGS,
         "PEAK_POINTS": len(PEAK_NODES),
-        "FORCE_POINTS": len(contact_forces.FORCE_FRACTIONS),
-        "FORCE_GAP": contact_forces.FORCE_GAP,
-        "ZERO_ITERATIONS": contact_forces.ZERO_ITERATIONS,
-        "SPREAD_FACTOR": contact_forces.spread_factor(),
+        "FORCE_POINTS": len(peaks.FORCE_FRACTIONS),
+        "FORCE_GAP": peaks.FORCE_GAP,
+        "ZERO_ITERATIONS": peaks.ZERO_ITERATIONS,
+        "SPREAD_FACTOR": peaks.spread_factor(),
         "PEAK_MARGIN": peaks.PEAK_MARGIN,
         "END_PEAK_MARGIN": margin,
         "NEWTON_STEP_LIMIT": polynomials.newton_step_limit(PEAK_NODES),

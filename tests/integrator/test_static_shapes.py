@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.simulation.integration_plan import integration_plan
 
 BEAM = jb.Beam(1.2, 12.0, 0.5, damping_ratio=0.02, modes=4)

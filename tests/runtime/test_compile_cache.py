@@ -7,17 +7,17 @@ import sys
 import jax
 import pytest
 
-from jaxbeam.runtime import compile_cache
+from jaxbeam.runtime import cache_folder
 from tests.modules import ROOT
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """The cache folder, not made yet; settings of JAX as before at the end."""
-    names = "jax_compilation_cache_dir", compile_cache.MIN_COMPILE_TIME
+    names = "jax_compilation_cache_dir", cache_folder.MIN_COMPILE_TIME
     before = {name: getattr(jax.config, name) for name in names}
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for name in (compile_cache.SIZE_VARIABLE, "JAX_COMPILATION_CACHE_DIR"):
+    for name in (cache_folder.SIZE_VARIABLE, "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     jax.config.update("jax_compilation_cache_dir", None)
     yield tmp_path / "jaxbeam"
@@ -27,7 +27,7 @@ def folder(tmp_path, monkeypatch):
 
 def used() -> str | None:
     """Folder of JAX's cache once it is switched on."""
-    compile_cache.switch_on()
+    cache_folder.switch_on()
     return jax.config.jax_compilation_cache_dir
 
 
@@ -45,9 +45,9 @@ def test_settings_of_the_user_prevail(folder, monkeypatch):
         assert used() is None
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
-    monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "0")
+    monkeypatch.setenv(cache_folder.SIZE_VARIABLE, "0")
     assert used() is None and not folder.exists()
-    monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "1 GB")
+    monkeypatch.setenv(cache_folder.SIZE_VARIABLE, "1 GB")
     with pytest.warns(UserWarning, match="JAXBEAM_CACHE_SIZE is to be a whole number of MiB, not"):
         assert used() is None
 
@@ -71,14 +71,14 @@ def test_the_oldest_programs_are_deleted_above_the_size(folder, monkeypatch):
     for path in (old, new):
         path.write_bytes(bytes(3 << 19))  # 1.5 MiB
     os.utime(old, (1, 1))
-    monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "2")
-    compile_cache.switch_on()
+    monkeypatch.setenv(cache_folder.SIZE_VARIABLE, "2")
+    cache_folder.switch_on()
     assert new.exists() and not old.exists()
 
 
 COMPILING = """
 import jax
-from jaxbeam.runtime.compile_cache import switch_on
+from jaxbeam.runtime.cache_folder import switch_on
 
 switch_on()
 jax.jit(jax.numpy.sin)(0.5)

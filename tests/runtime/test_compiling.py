@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.runtime import compile_cache, compiling, native_library
+from jaxbeam.runtime import cache_folder, compiling, native_library
 from jaxbeam.runtime.arrays import fori_loop, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 
@@ -193,10 +193,10 @@ def test_a_missing_compiler_and_one_that_fails_are_told(caplog, monkeypatch):
 
 def test_the_folder_of_the_cache_is_told(caplog, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setattr(compile_cache.jax.config, "update", lambda name, value: None)
-    monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "8")
+    monkeypatch.setattr(jax.config, "update", lambda name, value: None)
+    monkeypatch.setenv(cache_folder.SIZE_VARIABLE, "8")
     with caplog.at_level(logging.INFO, "jaxbeam"):
-        compile_cache.switch_on()
+        cache_folder.switch_on()
     assert caplog.messages[0].startswith("compile cache in ")
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.runtime.remembering import KEPT_RESULTS, remembered
+from jaxbeam.runtime.memory import KEPT_RESULTS, remembered
 
 BEAM = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
 CASE = jb.Case(BEAM, sensors=[jb.Sensor(0.3)])

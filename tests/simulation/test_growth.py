@@ -10,7 +10,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.growth import growth_limit, largest_by_marks
+from jaxbeam.integrator.inputs import growth_limit, largest_by_marks
 from tests.loop_as_oracle import expected
 
 DURATION, MODES = 4.0, 2  # s of a beam whose length, mass and stiffness are one

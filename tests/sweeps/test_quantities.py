@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.files.case_file import load_case, with_settings
 from jaxbeam.integrator.discrete_model import bounds_by_energy, energies
-from jaxbeam.integrator.static_shapes import longest_stable_step
-from jaxbeam.integrator.step_size import trial_run, without_later_vibration
+from jaxbeam.integrator.step_size import longest_stable_step, trial_run, without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.output_rows import sensor_rows

@@ -295,7 +295,7 @@ def test_stores_with_codecs_that_run_code_are_refused(copy, tmp_path, place):
 
 
 # Libraries go through one file, which verifies the HMAC of what it reads; nothing is unpickled.
-VETTED = "jaxbeam.runtime.trusted_code"
+VETTED = "jaxbeam.runtime.native_library"
 RUN = {"eval", "exec", "compile", "__import__"}
 UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib", "runpy"}
 LOAD = {"CDLL", "PyDLL", "WinDLL", "OleDLL", "LibraryLoader", "LoadLibrary", "load_library"}

@@ -42,8 +42,7 @@ from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
 from jaxbeam.integrator.peaks import RunningPeaks
 from jaxbeam.integrator.propagators import NODE_COUNT
-from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
-from jaxbeam.integrator.step_size import choose_step_size
+from jaxbeam.integrator.step_size import StaticShapes, choose_step_size, static_shapes
 from jaxbeam.integrator.time_grid import (
     EventSchedule,
     Transmission,

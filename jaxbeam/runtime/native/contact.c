@@ -1,4 +1,4 @@
-/* Contact forces of the loads on the beam in a step: integrator/step.py, integrator/contact_forces.py. */
+/* Contact forces of the loads on the beam in a step: integrator/step.py, integrator/peaks.py. */
 
 #include "contact.h"
 

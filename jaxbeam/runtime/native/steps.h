@@ -14,7 +14,7 @@ static double stiffness_of_mode(const Workspace *w, int block, int mode) {
     return fabs(matrix[(2 * mode + 1) * w->block_size + 2 * mode]);
 }
 
-/* Amplitude of a state, squared: integrator/growth.py, `amplitudes`. */
+/* Amplitude of a state, squared: integrator/inputs.py, `amplitudes`. */
 static Register squared_amplitude(const Workspace *w, const Register *state) {
     Register square = {0};
     for (int b = 0; b < w->blocks; b++, state += w->block_size)

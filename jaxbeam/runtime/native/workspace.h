@@ -78,7 +78,7 @@ enum {
 
 /* A sampled loop: what happens at an event, to the memory of the runs of a group and their commands
  * (sweeps/native_integration.py); numbers of commands and of marks in time up to which amplitudes
- * are compared (integrator/growth.py), and the place of the failures in the memory. Commands are
+ * are compared (integrator/inputs.py), and the place of the failures in the memory. Commands are
  * states that do not change between events, in each block. NULL without a loop. */
 typedef struct {
     void (*process)(const void *const *numbers, int64_t event, double time, Register *memory,
