@@ -3,7 +3,7 @@ from .analysis import ride as ride, sections as sections
 from .analysis.absorber_tuning import tuned_absorber as tuned_absorber
 from .analysis.assessment.assess import assess as assess
 from .analysis.bound.bound import bound as bound
-from .analysis.control_systems import to_control as to_control
+from .analysis.linearised_loop import to_control as to_control
 from .analysis.sections import envelope as envelope
 from .case import actuators as actuators, profiles as profiles
 from .case.absorbers import Absorber as Absorber
@@ -52,9 +52,8 @@ from .control.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.semi_active import SemiActive as SemiActive
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_controller import StateFeedback as StateFeedback
-from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
-from .estimation.kalman import Kalman as Kalman
+from .estimation.kalman import ExtendedKalman as ExtendedKalman, Kalman as Kalman
 from .estimation.moving_horizon import MovingHorizon as MovingHorizon
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case

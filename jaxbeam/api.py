@@ -23,8 +23,8 @@ from jaxbeam.files.case_file import case_from_tables, load_case_with
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 from jaxbeam.model.plausibility.facts import Plausibility
 from jaxbeam.runtime.progress import watching
-from jaxbeam.simulation.labels import OF_FLIGHTS
 from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.views import OF_FLIGHTS
 
 if TYPE_CHECKING:
     import xarray

@@ -19,9 +19,8 @@ from jaxbeam.analysis.bound.bound import run_peaks
 from jaxbeam.analysis.stability import frozen_poles, growth, stream
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.sensors import QUANTITIES, Filter
-from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.discrete_model import discrete_model, propagators
 from jaxbeam.integrator.integrate import max_stable_step
-from jaxbeam.integrator.propagators import propagators
 from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at

@@ -27,8 +27,8 @@ from jaxbeam.analysis.linearised_loop import (
     linearise_each,
     loop_timing,
     sampled_matrices,
+    stationary_loops,
 )
-from jaxbeam.analysis.stationary_loop import stationary_loops
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.trajectory import NEVER

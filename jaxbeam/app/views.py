@@ -13,8 +13,8 @@ from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.plot.drawing import DrawnVehicle, actuator_positions, drawn_vehicle, surface_height
-from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.views import wheel_labels
 
 MAX_FRAMES, MAX_SAMPLES = 400, 4000  # of a moving picture, of a history on the screen
 MAX_WHEELS = 12  # with a history of the contact force each

@@ -19,10 +19,9 @@ from jaxbeam.benchmark.problem import LOAD_STREAM, BenchmarkProblem
 from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
 from jaxbeam.integrator.integrate import step_inputs
 from jaxbeam.integrator.load_path import load_path
-from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.step import AffineMap, step_maps
 from jaxbeam.integrator.step_size import StaticShapes
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule

@@ -1,22 +1,129 @@
-"""Kalman filters of plants that vary while loads cross, of given and of estimated loads."""
+"""Kalman filters of plants that vary while loads cross, of given and of estimated loads.
+
+Vehicles that a filter does not estimate are simulated along with it. They, their weights,
+trajectories and the profile are given; they are driven by the estimated motion of the beam, so that
+no sensor in a vehicle is needed.
+"""
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.controller import AbstractSampledFilter, Estimate, EstimatedLoads
-from jaxbeam.estimation.observer import filter_gain, sensor_offsets
-from jaxbeam.estimation.sampled_plant import FilteredPlant, SensorChain, Transition, in_blocks
-from jaxbeam.estimation.simulated_vehicles import with_loads
+from jaxbeam.case.controller import (
+    AbstractContinuousFilter,
+    AbstractSampledFilter,
+    Estimate,
+    EstimatedLoads,
+)
+from jaxbeam.estimation.observer import filter_gain, sensor_offsets, with_loads
+from jaxbeam.estimation.sampled_plant import (
+    FilteredPlant,
+    SampleTiming,
+    SensorChain,
+    Transition,
+    in_blocks,
+)
 from jaxbeam.model.contact import mass_contact_rows
 from jaxbeam.model.output_rows import OutputRows
-from jaxbeam.model.state_space import Signal, StateSpace
+from jaxbeam.model.state_space import Plant, Signal, StateSpace
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, add_at, scan, take, xp
+
+
+class VehicleMemory(NamedTuple):
+    """State of the filter, and state of beam and vehicles and the command at the last sample."""
+
+    filter_state: Any
+    state: Float[Array, " all"]
+    command: Float[Array, " actuator"]
+
+
+class SampledWithVehicles(AbstractSampledFilter):
+    """A sampled filter with the states of the vehicles of a plant.
+
+    From sample to sample they are those of the coupled plant that starts from the estimated state
+    of the beam, by `SampleTiming.transition`.
+    """
+
+    filter: AbstractSampledFilter
+    plant: Plant
+    timing: SampleTiming
+    table: Transition | None = None  # at all samples
+
+    def tabulated(self, times):
+        def block(first, number):
+            return self.transition_at(times[first : first + number])
+
+        table = in_blocks(block, len(times))
+        return dataclasses.replace(self, filter=self.filter.tabulated(times), table=table)
+
+    def transition_at(self, t: Float[Array, "*sample"]) -> Transition:
+        """Transition of the coupled plant to the sample at t (s), or to several."""
+        if self.table is not None:
+            sample = self.timing.sample_at(t)
+            return jax.tree.map(lambda part: take(part, sample), self.table)
+
+        def matrices_at(times):
+            system = self.plant.augmented(times)
+            return system.A, system.B
+
+        size = self.plant.modal_model.state_count + self.plant.augmented_start.shape[0]
+        return self.timing.transition(matrices_at, np.zeros((size, size)), xp.ones(size), t)
+
+    def initial_state(self):
+        commands = xp.zeros(self.plant.commands)
+        beam = xp.zeros(self.plant.modal_model.state_count)
+        vehicles = self.plant.augmented_start[: self.plant.vehicle_states]
+        state = xp.concatenate([beam, vehicles])
+        return VehicleMemory(self.filter.initial_state(), state, commands)
+
+    def update(self, state: VehicleMemory, measurement, t):
+        plant = self.plant
+        estimate, filter_state = self.filter.update(state.filter_state, measurement, t)
+        beam = plant.modal_model.state_count
+        constants = plant.augmented_start[plant.vehicle_states :]
+        x = xp.concatenate([state.state, constants])
+        predicted = self.transition_at(t).predict(x, state.command, measurement.command)
+        vehicles = predicted[beam : beam + plant.vehicle_states]
+        # A run starts at rest: there is no period before it.
+        vehicles = xp.where(t > 0, vehicles, state.state[beam:])
+        estimate = estimate._replace(vehicles=vehicles)
+        present = xp.concatenate([estimate.state, vehicles])
+        return estimate, VehicleMemory(filter_state, present, measurement.command)
+
+
+class ContinuousWithVehicles(AbstractContinuousFilter):
+    """A filter in continuous time with the states of the vehicles of a plant.
+
+    They are integrated, as differences from those at the start, after the states of the filter.
+    """
+
+    filter: AbstractContinuousFilter
+    plant: Plant
+
+    @property
+    def state_count(self):
+        return self.filter.state_count + self.plant.vehicle_states
+
+    def estimate(self, state, measurement, t):
+        own = self.filter.state_count
+        estimate = self.filter.estimate(state[:own], measurement, t)
+        vehicles = self.plant.augmented_start[: self.plant.vehicle_states] + state[own:]
+        return estimate._replace(vehicles=vehicles)
+
+    def rates(self, state, measurement, command, t):
+        estimate, own = self.estimate(state, measurement, t), self.filter.state_count
+        system, beam = self.plant.augmented(t), self.plant.modal_model.state_count
+        constants = self.plant.augmented_start[self.plant.vehicle_states :]
+        x = xp.concatenate([estimate.state, estimate.vehicles, constants])
+        rates = system.A @ x + system.B @ command
+        of_filter = self.filter.rates(state[:own], measurement, command, t)
+        return xp.concatenate([of_filter, rates[beam : beam + self.plant.vehicle_states]])
+
 
 Square = Float[Array, "state state"]
 

@@ -21,7 +21,6 @@ from jaxbeam.case.controller import (
 from jaxbeam.case.fields import POSITIVE, concrete, number
 from jaxbeam.estimation.observability import mode_count, observability_error
 from jaxbeam.estimation.sampled_plant import FilteredPlant, SampleTiming, Transition
-from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.model.state_space import Plant, StateSpace
 from jaxbeam.numerics.finite_horizon import GainTable
 from jaxbeam.numerics.riccati import care, dare
@@ -282,3 +281,16 @@ def _modal_placed_gain(A, C, desired) -> Float[Array, "state sensor"]:
     modal = desired.shape[0]
     gain = placed_gain(A[:modal, :modal], C[:, :modal], desired)
     return set_at(xp.zeros((A.shape[0], C.shape[0])), np.s_[:modal], gain)
+
+
+def with_loads(plant: Plant, state, added, t, with_weights: bool) -> Estimate:
+    """Estimate of a plant from the states that `Plant.augmented` adds, at t (s).
+
+    It has the weights only `with_weights`; they are zero for wheels off the beam.
+    """
+    count = plant.vehicle_states
+    vehicles = added[:count] if count else None
+    if not with_weights:
+        return Estimate(state, vehicles=vehicles)
+    weights = added[count : count + plant.weights.shape[0]]
+    return Estimate(state, xp.where(plant.loads.on_beam(t), weights, 0.0), vehicles)

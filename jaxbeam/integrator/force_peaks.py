@@ -18,6 +18,7 @@ from jaxbeam.case.case import ALL, Case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import wheel_distances
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.discrete_model import PEAK_NODES
 from jaxbeam.integrator.force_system import (
     ForceResponses,
     ForceSystem,
@@ -26,7 +27,6 @@ from jaxbeam.integrator.force_system import (
     table_points,
 )
 from jaxbeam.integrator.peaks import Peaks
-from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.numerics.polynomials import estimate_peak, refine_peak
 

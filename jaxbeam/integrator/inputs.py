@@ -15,7 +15,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -94,7 +93,8 @@ class HeldCommands(AbstractInputPolicy):
             lambda memory: memory,
             memory,
         )
-        return memory.reshape(NODE_COUNT, -1, memory.shape[-1]), memory
+        actuators = self.model.command_matrix.shape[1]
+        return memory.reshape(-1, actuators, memory.shape[-1]), memory
 
     def observe(self, memory, info):
         return None

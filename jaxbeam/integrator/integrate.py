@@ -18,7 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.discrete_model import DiscreteModel, energies
+from jaxbeam.integrator.discrete_model import (
+    GAUSS_NODES,
+    MAX_STEP_NORM,
+    NODE_COUNT,
+    DiscreteModel,
+    energies,
+    state_matrix_norm,
+)
 from jaxbeam.integrator.inputs import (
     OVERFLOW,
     AbstractInputPolicy,
@@ -32,7 +39,6 @@ from jaxbeam.integrator.inputs import (
 )
 from jaxbeam.integrator.load_path import END_FRACTIONS, LoadPath, end_forces, load_path
 from jaxbeam.integrator.peaks import RunningPeaks, initial_peaks, update_peaks
-from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.step import advance_free, advance_unforced, step_maps
 from jaxbeam.integrator.step_matrices import (
     chunk_length,

@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.integrator.load_path import END_FRACTIONS
-from jaxbeam.integrator.propagators import (
+from jaxbeam.integrator.discrete_model import (
     GAUSS_NODES,
     NODE_COUNT,
     PEAK_NODES,
@@ -29,6 +28,7 @@ from jaxbeam.integrator.propagators import (
     phi_functions_of,
     propagators,
 )
+from jaxbeam.integrator.load_path import END_FRACTIONS
 from jaxbeam.model.contact import solve_at_instants, surface_rows, vehicle_system
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel

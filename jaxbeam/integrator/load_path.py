@@ -9,8 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.integrator.discrete_model import DiscreteModel
-from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES, end_weights
+from jaxbeam.integrator.discrete_model import GAUSS_NODES, PEAK_NODES, DiscreteModel, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import KinkSteps, SurfaceRows, solve_at_instants, surface_rows
 from jaxbeam.model.load_set import LoadSet

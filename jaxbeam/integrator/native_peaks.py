@@ -21,15 +21,20 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.profiles.spectra import ProfilesOfRuns
-from jaxbeam.integrator.discrete_model import bounds_by_energy, commands_at_once
+from jaxbeam.integrator.discrete_model import (
+    GAUSS_NODES,
+    NODE_COUNT,
+    PEAK_NODES,
+    bounds_by_energy,
+    commands_at_once,
+)
 from jaxbeam.integrator.inputs import MARK_COUNT
 from jaxbeam.integrator.load_path import END_FRACTIONS
 from jaxbeam.integrator.peaks import FORCE_FRACTIONS, Peaks, force_weights_at_fractions
-from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.integrator.vehicles import absorber_weights
 from jaxbeam.model.contact import initial_vehicle_states, may_have_kinks
-from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.elements import is_uniform
 from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.output_rows import OutputRows, StaticCorrection, linear_outputs

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.discrete_model import NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.load_path import LoadPath
-from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.numerics.polynomials import (
     estimate_peak,

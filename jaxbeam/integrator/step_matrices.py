@@ -26,9 +26,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.integrator.discrete_model import DiscreteModel
+from jaxbeam.integrator.discrete_model import NODE_COUNT, PEAK_NODES, DiscreteModel
 from jaxbeam.integrator.load_path import LoadPath
-from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.model.contact import KinkSteps, ModalCompliance, SurfaceRows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel

@@ -22,14 +22,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.integrator.load_path import LoadPath
-from jaxbeam.integrator.propagators import (
+from jaxbeam.integrator.discrete_model import (
     GAUSS_NODES,
     NODE_COUNT,
     PEAK_NODES,
     force_weights,
     phi_functions_of,
 )
+from jaxbeam.integrator.load_path import LoadPath
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
 from jaxbeam.numerics.polynomials import lagrange_coefficients

@@ -17,7 +17,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.layout import NODE_TOLERANCE, actuator_terms, node_positions
+from jaxbeam.model.elements import NODE_TOLERANCE, actuator_terms, node_positions
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array, any_traced, set_at, xp
 

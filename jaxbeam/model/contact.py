@@ -39,7 +39,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.layout import kink_nodes
+from jaxbeam.model.elements import kink_nodes
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.transfer_matrices import has_settlement

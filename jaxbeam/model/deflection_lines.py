@@ -17,8 +17,8 @@ from jaxbeam.case.sensors import TWIST, TWIST_RATE
 from jaxbeam.case.track import Kernel
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
+from jaxbeam.model.elements import is_uniform
 from jaxbeam.model.flexibility import Flexibility, check_supported, flexibility
-from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout, Modes, mesh_layout

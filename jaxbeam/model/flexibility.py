@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.model.layout import Layout, is_uniform
+from jaxbeam.model.elements import Layout, is_uniform
 from jaxbeam.model.modes import assemble_matrices, section_properties, supported_matrices
 from jaxbeam.model.transfer_matrices import SectionFlexibility, is_held, section_flexibility
 from jaxbeam.numerics.polynomials import piecewise_chebyshev

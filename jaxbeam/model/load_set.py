@@ -19,7 +19,7 @@ from jaxbeam.case.loads.base import (
 )
 from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractTrajectory, has_come
-from jaxbeam.model.layout import Layout
+from jaxbeam.model.elements import Layout
 from jaxbeam.model.transfer_matrices import surface
 from jaxbeam.runtime.arrays import Array, Module, add_at, is_jax, is_numpy, xp
 

@@ -31,13 +31,17 @@ from jaxbeam.model.elements import (
     RIGIDITY,
     SHEAR,
     FieldParts,
+    Layout,
     Sections,
     assemble_sections,
     bending_basis,
+    find_layout,
+    is_uniform,
+    longest_span,
+    node_positions,
     section_fields,
     sections,
 )
-from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.torsion import TorsionMatrices, torsion_matrices, twists
 from jaxbeam.model.track import layers
 from jaxbeam.model.transfer_matrices import check_buckling

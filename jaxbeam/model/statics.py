@@ -23,7 +23,7 @@ from jaxbeam.model.deflection_lines import (
     unchecked_influence_line,
     validated_layout,
 )
-from jaxbeam.model.layout import Layout, is_uniform
+from jaxbeam.model.elements import Layout, is_uniform
 from jaxbeam.model.output_rows import SIDE_DISTANCE, at_side, quantity_factor
 from jaxbeam.model.static_correction import section_stiffness
 from jaxbeam.model.transfer_matrices import settlement_response

@@ -22,7 +22,7 @@ from numpy.polynomial import chebyshev, legendre
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import NO_TORSION, TWIST
-from jaxbeam.model.layout import Layout, node_positions
+from jaxbeam.model.elements import Layout, node_positions
 from jaxbeam.numerics.polynomials import legendre_to_chebyshev
 from jaxbeam.runtime.arrays import Array, Module, add_at, set_at, take, xp
 

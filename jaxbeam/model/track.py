@@ -34,7 +34,7 @@ from numpy.polynomial import chebyshev, legendre
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.track import Kernel
-from jaxbeam.model.layout import Layout
+from jaxbeam.model.elements import Layout
 from jaxbeam.numerics.polynomials import chebyshev_polynomials
 from jaxbeam.runtime.arrays import Array, Module, add_at, block_diag, take, xp
 

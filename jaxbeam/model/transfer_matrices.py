@@ -33,13 +33,16 @@ from jaxbeam.model.elements import (
     FOUNDATION,
     RIGIDITY,
     SHEAR,
+    Layout,
     Sections,
+    actuator_nodes,
     add_nodal_parts,
     assemble_sections,
+    find_layout,
+    kink_nodes,
     nodal_unknowns,
     sections,
 )
-from jaxbeam.model.layout import Layout, actuator_nodes, find_layout, kink_nodes
 from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev, slope_jumps
 from jaxbeam.runtime.arrays import Array, Module, add_at, set_at, solve, take, xp
 

@@ -21,8 +21,8 @@ from jaxbeam.plot.style import (
     tinted,
     unit_scale,
 )
-from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.views import wheel_labels
 
 MAX_CURVES = 5  # wheels or bodies of a load with a curve each; those of more are an envelope
 SAME_FORCE = 1e-6  # of the static load, by which a contact force may differ from it

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.fields import concrete
+from jaxbeam.integrator.discrete_model import GAUSS_NODES, NODE_COUNT
 from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo, load_amplitude
-from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.integrator.time_grid import (
     EventSchedule,
     Transmission,
@@ -58,8 +58,14 @@ from jaxbeam.runtime.arrays import (
 )
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
-from jaxbeam.simulation.commands import CommandMemory, CommandPath, command_path, limit_commands
-from jaxbeam.simulation.voltage_limits import VoltageLimits, with_missing_voltages
+from jaxbeam.simulation.commands import (
+    CommandMemory,
+    CommandPath,
+    VoltageLimits,
+    command_path,
+    limit_commands,
+    with_missing_voltages,
+)
 
 SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law

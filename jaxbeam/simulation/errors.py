@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import QUANTITIES, TWIST, Sensor, quantity_of
+from jaxbeam.integrator.discrete_model import PEAK_NODES
 from jaxbeam.integrator.peaks import Peaks, RunningPeaks
-from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_size import UNSAMPLED, StepTrial, trial_positions
-from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.elements import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes

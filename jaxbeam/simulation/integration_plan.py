@@ -44,7 +44,7 @@ from jaxbeam.integrator.step_size import (
     steps_per_interval,
 )
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule
-from jaxbeam.model.layout import largest_layout
+from jaxbeam.model.elements import largest_layout
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, Module, any_jax, xp

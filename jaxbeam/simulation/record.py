@@ -26,9 +26,8 @@ from jaxbeam.runtime.arrays import Array, Module, any_traced, set_at, take, to_n
 from jaxbeam.runtime.printer import TableViews, labelled_dataset
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.errors import Extremes, chosen_samples, truncation_errors
-from jaxbeam.simulation.labels import Flights, contact_sentence, flights_sentence
 from jaxbeam.simulation.section_forces import history
-from jaxbeam.simulation.views import RecordViews
+from jaxbeam.simulation.views import Flights, RecordViews, contact_sentence, flights_sentence
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -195,10 +194,6 @@ def _larger(one: tuple, other: tuple) -> tuple:
         xp.where(is_larger[:, None] if a.ndim == 2 else is_larger, b, a)
         for a, b in zip(one, other, strict=True)
     )
-
-
-if TYPE_CHECKING:
-    pass
 
 
 class Result(enum.IntFlag):

@@ -11,14 +11,14 @@ from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.netcdf import check_codecs
-from jaxbeam.model.elements import sections
-from jaxbeam.model.layout import Layout, is_uniform
+from jaxbeam.model.elements import Layout, is_uniform, sections
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.torsion import twists
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
-from jaxbeam.simulation.labels import (
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.views import (
     MODE_FIELDS,
     MODE_VARIABLES,
     OF_ABSORBERS,
@@ -26,7 +26,6 @@ from jaxbeam.simulation.labels import (
     VARIABLES,
     Flights,
 )
-from jaxbeam.simulation.record import Record
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

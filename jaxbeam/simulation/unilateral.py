@@ -53,8 +53,8 @@ from jaxbeam.model.output_rows import sensor_history
 from jaxbeam.model.sensor_signals import VehicleMotion, relative_to_beam
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.simulation.integration_plan import IntegrationPlan
-from jaxbeam.simulation.labels import Flights
 from jaxbeam.simulation.section_forces import motion_of
+from jaxbeam.simulation.views import Flights
 
 ROUNDING = 1e-9  # of forces, gaps and velocities
 LEAST = 1e-300

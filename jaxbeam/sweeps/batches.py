@@ -17,9 +17,9 @@ from jaxbeam.case.case import Case, concrete_case, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
+from jaxbeam.integrator.discrete_model import NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
-from jaxbeam.model.layout import largest_layout
+from jaxbeam.model.elements import largest_layout
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.model.modes import Layout, mesh_layout

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import (
     Case,
     addresses,
+    concrete_case,
     each_address,
     list_sizes,
     overlap,
@@ -36,6 +37,8 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.native_peaks import MIN_RUNS_TO_COMPILE
 from jaxbeam.integrator.step_size import check_tolerance
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.static_correction import is_supported
 from jaxbeam.runtime.memory import block_memory
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import (
@@ -50,7 +53,6 @@ from jaxbeam.sweeps.batches import (
 )
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner, SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, ForceRunner, force_runner
-from jaxbeam.sweeps.quality import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
@@ -257,6 +259,12 @@ def specification_from_dict(content: dict[str, Any]) -> SweepSpecification:
     case, settings = case_from_dict(content["case"]), content["settings"]
     kept = {name: content[name] for name in ("block_bytes", "several")}
     return SweepSpecification(case, axes, *settings, **kept)
+
+
+def is_corrected(case: Case) -> bool:
+    """Whether peaks of curvatures, strains and section forces are statically corrected."""
+    case = concrete_case(case)
+    return is_supported(case, mesh_layout(case))
 
 
 def sweep_specification(

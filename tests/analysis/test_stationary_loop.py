@@ -10,9 +10,8 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linearised_loop
+from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at, stationary_loops
 from jaxbeam.analysis.stability import growth, loop_gain, margins, stability_margin
-from jaxbeam.analysis.stationary_loop import loop_with_mass_at, stationary_loops
 from jaxbeam.case.controller import AbstractStaticController
 from jaxbeam.cli import main
 from tests.loop_as_oracle import span_of

@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.c_code import CProgram, export_c, write_c
 from jaxbeam.c_code.program import samples_text
 from jaxbeam.c_code.sampled_program import RecordedLoop
-from jaxbeam.estimation.extended_kalman import DIFFERENCE_STEP
+from jaxbeam.estimation.kalman import DIFFERENCE_STEP
 from jaxbeam.fmi import ControllerSteps
 from jaxbeam.model.sensor_signals import to_reading
 from tests.c_code.cases import CASES, DESIGNED_TABLES, PERIOD

@@ -21,7 +21,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
-from jaxbeam.sweeps.quality import FailedRunsWarning
+from jaxbeam.sweeps.computation import FailedRunsWarning
 from tests.differences import central
 from tests.loop_as_oracle import expected
 

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.discrete_model import GAUSS_NODES
 from jaxbeam.integrator.peaks import contact_minimum
-from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
 from tests.oracles.crossing import Load

@@ -5,10 +5,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.discrete_model import GAUSS_NODES, discrete_model
 from jaxbeam.integrator.integrate import _weights, integrate_history, step_inputs
 from jaxbeam.integrator.load_path import END_FRACTIONS, end_forces, load_path
-from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import load_set

@@ -15,8 +15,8 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.output_rows import linear_outputs, sensor_rows
 from jaxbeam.numerics.polynomials import piecewise_chebyshev
 from jaxbeam.simulation.section_forces import outputs_of_forces
+from jaxbeam.sweeps.computation import SAMPLES, WorstRun, estimated_errors
 from jaxbeam.sweeps.force_runner import _systems, force_runner
-from jaxbeam.sweeps.quality import SAMPLES, WorstRun, estimated_errors
 from jaxbeam.sweeps.specification import sweep_specification
 
 BEAM = jb.Beam(12.0, 4e8, 2000.0, 0.02, modes=3)

@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.integrator import native_peaks, peaks, propagators, step_matrices
-from jaxbeam.integrator.propagators import PEAK_NODES
+from jaxbeam.integrator import discrete_model, native_peaks, peaks, step_matrices
+from jaxbeam.integrator.discrete_model import PEAK_NODES
 from jaxbeam.numerics import polynomials
 from jaxbeam.numerics.polynomials import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
@@ -249,9 +249,9 @@ def test_constants_are_those_of_the_c_code():
     expected = {
         "PADDING": 8,  # doubles in the widest vector register
         "CHUNK_STEPS": step_matrices.CHUNK_STEPS,
-        "NODES": propagators.NODE_COUNT,
-        "TAYLOR_TERMS": propagators.TAYLOR_TERMS,
-        "DOUBLINGS": propagators.DOUBLINGS,
+        "NODES": discrete_model.NODE_COUNT,
+        "TAYLOR_TERMS": discrete_model.TAYLOR_TERMS,
+        "DOUBLINGS": discrete_model.DOUBLINGS,
         "PEAK_POINTS": len(PEAK_NODES),
         "FORCE_POINTS": len(peaks.FORCE_FRACTIONS),
         "FORCE_GAP": peaks.FORCE_GAP,

@@ -140,7 +140,7 @@ def test_bounded_loops_beyond_the_length_by_the_oracle():
     assert_allclose(found, truth, rtol=0, atol=1e-6 * np.abs(truth).max())
 
 
-@pytest.mark.filterwarnings("ignore::jaxbeam.sweeps.quality.FailedRunsWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.sweeps.computation.FailedRunsWarning")
 def test_sweeps_fail_where_the_loop_diverges_only():
     gains = np.array([0.0, 10.0, 1e5])
     runs = jb.sweep(SOFT, {"controller.gains.0": gains}, progress=False)

@@ -7,8 +7,8 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.sensors import QUANTITIES
+from jaxbeam.integrator.discrete_model import PEAK_NODES
 from jaxbeam.integrator.peaks import RunningPeaks
-from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.errors import interpolation_errors

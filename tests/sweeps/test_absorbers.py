@@ -11,7 +11,7 @@ import jaxbeam as jb
 from jaxbeam.cli.commands.sweep import _absorber_lines
 from jaxbeam.files.tables import sweep_columns
 from jaxbeam.integrator import native_peaks
-from jaxbeam.sweeps.quality import StrokeWarning
+from jaxbeam.sweeps.computation import StrokeWarning
 from tests.simulation.test_absorbers import BRIDGE, first_principles
 
 PEAKS = "peak_stroke", "peak_absorber_force"

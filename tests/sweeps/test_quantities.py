@@ -15,7 +15,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.simulation.errors import MAX_SAMPLES
-from jaxbeam.sweeps.quality import SAMPLES, TruncationWarning
+from jaxbeam.sweeps.computation import SAMPLES, TruncationWarning
 from tests.modules import ROOT
 
 BEAM = jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3)

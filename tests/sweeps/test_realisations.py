@@ -10,7 +10,7 @@ import scipy
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
 from jaxbeam.plot import plot_realisations
-from jaxbeam.sweeps import words
+from jaxbeam.sweeps import sweep as sweeps
 from jaxbeam.sweeps.realisations import (
     interval_ranks,
     least_count,
@@ -117,7 +117,7 @@ def test_seeds_as_runs_of_a_batch_and_one_by_one(c_library, monkeypatch):
     over = {"profile.seed": range(1, 11), "loads.0.speed": [18.0, 23.0]}
     together = jb.sweep(ROUGH, over, progress=False)
     some = {"profile.seed": [2, 9], "loads.0.speed": [18.0, 23.0]}
-    monkeypatch.setattr(words, "_computed_together", lambda parts, bar: [])
+    monkeypatch.setattr(sweeps, "_computed_together", lambda parts, bar: [])
     alone = jb.sweep(ROUGH, some, progress=False)
     assert together["profile.seed"].values.tolist() == list(range(1, 11))
     found = together.sel({"profile.seed": [2, 9]})

@@ -30,7 +30,7 @@ from jaxbeam.model.statics import static_peak
 from jaxbeam.sweeps import force_runner
 from jaxbeam.sweeps.batches import make_batches
 from jaxbeam.sweeps.blocks import Runner
-from jaxbeam.sweeps.quality import FailedRunsWarning
+from jaxbeam.sweeps.computation import FailedRunsWarning
 from jaxbeam.sweeps.step_size import path_times
 from jaxbeam.sweeps.store import block_places
 

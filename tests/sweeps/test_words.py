@@ -17,7 +17,7 @@ from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.load_set import load_set
 from jaxbeam.sweeps import integration
 from jaxbeam.sweeps.store import ZarrStore, kept_blocks, status
-from jaxbeam.sweeps.words import with_numbers
+from jaxbeam.sweeps.sweep import with_numbers
 
 BEAM = jb.Beam(25.0, 3.0e10, 15000.0, damping_ratio=0.01, modes=1)
 CASE = jb.Case(

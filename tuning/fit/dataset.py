@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.time_grid import EventSchedule, stack_schedules
-from jaxbeam.model.layout import largest_layout
+from jaxbeam.model.elements import largest_layout
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log

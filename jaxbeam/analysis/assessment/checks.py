@@ -51,9 +51,8 @@ from jaxbeam.model.output_rows import (
     static_correction,
 )
 from jaxbeam.model.statics import REACTION
-from jaxbeam.sweeps.computation import peaks_in_memory
+from jaxbeam.sweeps.computation import failure_sentence, peaks_in_memory
 from jaxbeam.sweeps.force_runner import PHASE
-from jaxbeam.sweeps.quality import failure_sentence
 from jaxbeam.sweeps.specification import sweep_specification
 
 LINE_POINTS = 801  # along the beam, between which influence lines are linear

@@ -37,11 +37,10 @@ from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import check_on_beam, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
-from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
 from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
 from jaxbeam.integrator.peaks import RunningPeaks
-from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.step_size import StaticShapes, choose_step_size, static_shapes
 from jaxbeam.integrator.time_grid import (
     EventSchedule,

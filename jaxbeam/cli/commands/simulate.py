@@ -91,7 +91,7 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
     import numpy as np
 
     from jaxbeam.analysis.ride import wheel_unloading
-    from jaxbeam.simulation.labels import wheel_labels
+    from jaxbeam.simulation.views import wheel_labels
 
     loads, labels = record.loads, wheel_labels(record.loads)
     static, lowest = np.asarray(loads.weight)[:, 0], np.asarray(record.lowest_contact_force)

@@ -47,7 +47,7 @@ def stability(
     options.check_outputs(picture, loop_picture)
     parsed_case = options.read(case)
 
-    from jaxbeam.analysis.linearised_loop import linearised_loop
+    from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
     from jaxbeam.analysis.stability import (
         frozen_poles,
         growth,
@@ -57,7 +57,6 @@ def stability(
         stream,
         stream_excess,
     )
-    from jaxbeam.analysis.stationary_loop import loop_with_mass_at
 
     along_crossing = stability_margin(parsed_case)
     # Before the first load: loads off the beam leave the loop as it is.

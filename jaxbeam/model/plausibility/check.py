@@ -23,7 +23,7 @@ from jaxbeam.case.case import Case, concrete_case, structure_of
 from jaxbeam.case.fields import all_concrete, concrete, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.model import modes as beam_modes
-from jaxbeam.model.layout import Layout
+from jaxbeam.model.elements import Layout
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.plausibility import loads, structure
 from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers

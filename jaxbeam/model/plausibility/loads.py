@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.layout import NODE_TOLERANCE
+from jaxbeam.model.elements import NODE_TOLERANCE
 from jaxbeam.model.plausibility.facts import GRAVITY
 from jaxbeam.model.plausibility.structure import (
     INF,

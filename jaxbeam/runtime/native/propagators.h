@@ -1,4 +1,4 @@
-/* Propagators of all step lengths: integrator/propagators.py, `propagators`. TAYLOR_TERMS and DOUBLINGS
+/* Propagators of all step lengths: integrator/discrete_model.py, `propagators`. TAYLOR_TERMS and DOUBLINGS
  * are macros. */
 
 #pragma once

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
+from jaxbeam.integrator.discrete_model import GAUSS_NODES, NODE_COUNT
 from jaxbeam.integrator.vehicles import (
     VehicleStep,
     springs_of_wheels,

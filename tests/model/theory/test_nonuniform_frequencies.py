@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.beam import rayleigh_coefficients
 from jaxbeam.case.case import replace, value_at
-from jaxbeam.model.layout import find_layout
+from jaxbeam.model.elements import find_layout
 from jaxbeam.model.modes import mesh_layout, safe_sqrt
 from jaxbeam.model.transfer_matrices import critical_axial_force
 from tests.differences import central

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.model.load_set import load_set
-from jaxbeam.simulation.labels import contact_sentence, wheel_labels
 from jaxbeam.simulation.stored_record import record_from_xarray
+from jaxbeam.simulation.views import contact_sentence, wheel_labels
 from tests.simulation.test_record import assert_same
 
 WAGON = jb.vehicles.Wagon(
