@@ -17,8 +17,9 @@ from jaxbeam.case.sensors import quantity_of
 from jaxbeam.case.track import Kernel
 from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections
+from jaxbeam.model.elements import held_positions
 from jaxbeam.model.modes import modes
-from jaxbeam.model.statics import REACTION, held_positions, influence_line
+from jaxbeam.model.statics import REACTION, influence_line
 
 POSITIONS = 41  # along the beam by default, in addition to the special ones
 LINE_POINTS = 2001  # along the beam, between which influence lines are linear

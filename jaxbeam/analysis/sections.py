@@ -34,9 +34,10 @@ from jaxbeam.model.along_beam import (
     refined,
     sections,
 )
+from jaxbeam.model.elements import held_positions
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.static_correction import bending_moment, corrected_history, shear_force
-from jaxbeam.model.statics import REACTION, held_positions, influence_line, static_peak
+from jaxbeam.model.statics import REACTION, influence_line, static_peak
 from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.printer import TableViews

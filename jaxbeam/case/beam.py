@@ -444,6 +444,11 @@ class Beam(ReprWithUnits):
         return not (self.segments or self.hinges) and all(value is None for value in others)
 
     @property
+    def twists(self) -> bool:
+        """Whether it has a torsional rigidity."""
+        return self.torsional_rigidity is not None
+
+    @property
     def left_end(self) -> str:
         """End condition at x = 0."""
         return self.ends.split("-")[0]

@@ -197,7 +197,7 @@ def _check_layers(case: Case) -> None:
     ratios = beam.damping_ratio is not None and np.ndim(beam.damping_ratio) > 0
     others = {
         "contact.kind 'unilateral'": case.lifts,
-        "beam.torsional_rigidity": beam.torsional_rigidity is not None,
+        "beam.torsional_rigidity": beam.twists,
         "several damping ratios in beam.damping_ratio": ratios,
         "a loss_factor of one of beam.segments": any(
             s.loss_factor is not None for s in beam.segments
@@ -228,7 +228,7 @@ def _check_torsion(case: Case) -> None:
     with an eccentric mass, and of rigid masses over kinks of the twist.
     """
     eccentric = [i for i, load in enumerate(case.loads) if load.eccentricity is not None]
-    if case.beam.torsional_rigidity is None:
+    if not case.beam.twists:
         for i in eccentric:
             raise ValueError(f"loads.{i}.eccentricity would have no effect: {NO_TORSION}")
         for i, sensor in enumerate(case.sensors):

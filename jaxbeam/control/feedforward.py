@@ -32,7 +32,6 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
-from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER, SAME_FRACTION, SAME_SAMPLE, SAME_TIME, has_come
 from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.runtime.arrays import Array, Number, xp
@@ -298,9 +297,7 @@ def _tabulated(breakpoints, rows, x, rounding) -> Float[Array, "row ..."]:
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:
     """Times (s) at which each load passes the gates; NaN where it does not."""
-    times = np.stack(
-        [concrete(trajectory(load, length).passage_times(gates))[:2] for load in loads]
-    )
+    times = np.stack([concrete(load.trajectory(length).passage_times(gates))[:2] for load in loads])
     return np.where(times < NEVER, times, np.nan)
 
 

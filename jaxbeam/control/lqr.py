@@ -27,7 +27,7 @@ from jaxbeam.case.fields import (
     number,
     part,
 )
-from jaxbeam.case.loads.base import VehicleModel, trajectory
+from jaxbeam.case.loads.base import VehicleModel
 from jaxbeam.control.crossing_gains import (
     GainSchedule,
     PositionGainLaw,
@@ -516,7 +516,7 @@ class LQR(AbstractStateController):
                 return f"schedule needs loads of one wheel; loads.{i} has more: take 'time'"
         if case.loads[0].speed is None and self.speeds is None:
             return "speeds must be given where the first load has a table of positions"
-        paths = [trajectory(load, case.beam.length) for load in case.loads]
+        paths = [load.trajectory(case.beam.length) for load in case.loads]
         directions = [path.direction() for path in paths]
         if all(map(is_concrete, directions)) and len({float(concrete(x)) for x in directions}) > 1:
             return "schedule needs loads that all travel in one direction; take 'time'"

@@ -267,14 +267,6 @@ NUMBERS = 3  # of each load: position (m), speed (m/s), mass (kg)
 LoadNumbers = Float[Array, "*variant load"]
 
 
-class FollowingState(NamedTuple):
-    """Estimate x after a sample, its covariance, and the command of that sample."""
-
-    x: Float[Array, " state"]
-    covariance: Square
-    command: Float[Array, " actuator"]
-
-
 class LoadFollowingFilter(AbstractSampledFilter):
     """Kalman filter of a plant linearised about the estimated positions, speeds and masses.
 
@@ -305,7 +297,7 @@ class LoadFollowingFilter(AbstractSampledFilter):
 
     def initial_state(self):
         commands = self.filtered.plant.commands
-        return FollowingState(self.initial, self.initial_covariance, xp.zeros(commands))
+        return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
     def update(self, state, measurement, t):
         command = measurement.command
@@ -317,10 +309,10 @@ class LoadFollowingFilter(AbstractSampledFilter):
             rows = xp.where(measurement.present[:, None], rows, 0.0)
         gain, covariance = corrected(covariance, rows, self.sensor_chain.noise_covariance)
         x = x + gain @ measurement.innovation(readings)
-        return self._estimate(x), FollowingState(x, covariance, command)
+        return self._estimate(x), FilterState(x, covariance, command)
 
     def predict(
-        self, state: FollowingState, command: Float[Array, " actuator"], t: Float[Array, ""]
+        self, state: FilterState, command: Float[Array, " actuator"], t: Float[Array, ""]
     ) -> tuple[Float[Array, " state"], Square]:
         """State at the sample at t (s), before its readings, and its covariance."""
         variants = self._variants(state.x)

@@ -35,7 +35,12 @@ from jaxbeam.model.output_rows import (
     linear_outputs,
 )
 from jaxbeam.numerics.matrices import MAX_UNROLLED_TERMS
-from jaxbeam.numerics.polynomials import gauss_nodes, lagrange_coefficients
+from jaxbeam.numerics.polynomials import (
+    gauss_nodes,
+    lagrange_coefficients,
+    lagrange_weights,
+    shift_weights,
+)
 from jaxbeam.runtime.arrays import (
     Array,
     Module,
@@ -77,8 +82,7 @@ class Propagators(Module):
 
 def end_weights() -> np.ndarray:
     """Weights (node, end) that extrapolate values at the Gauss nodes to the ends of a step."""
-    coefficients = lagrange_coefficients(NODE_COUNT)
-    return np.stack([coefficients[:, 0], coefficients.sum(axis=1)], axis=1)
+    return lagrange_weights(NODE_COUNT, [0.0, 1.0]).T
 
 
 def _multiply(a, b):
@@ -208,19 +212,12 @@ def _double_argument(functions, _):
     """exp and phi functions of twice the argument."""
     transition, phi_functions = functions
     propagated = vmap(functools.partial(_multiply, transition))(phi_functions)
-    others = _doubling_weights() @ phi_functions.reshape(NODE_COUNT, -1)
+    others = shift_weights(NODE_COUNT) @ phi_functions.reshape(NODE_COUNT, -1)
     doubled = propagated + others.reshape(phi_functions.shape)
     powers_of_half = 0.5 ** np.arange(1, NODE_COUNT + 1).reshape(
         NODE_COUNT, *(1,) * transition.ndim
     )
     return (_multiply(transition, transition), doubled * powers_of_half), None
-
-
-@functools.cache
-def _doubling_weights() -> np.ndarray:
-    """Weights 1 / (p - l)! of phi_l in phi_p of the doubled argument."""
-    rows = range(1, NODE_COUNT + 1)
-    return np.array([[1 / math.factorial(p - q) if q <= p else 0.0 for q in rows] for p in rows])
 
 
 def monitored_rows(
@@ -246,7 +243,7 @@ def monitored_rows(
     if on_commands is not None:
         first = model.modes_per_block
         commands = np.s_[..., 0, first : first + on_commands.shape[1]]
-        at_nodes = force_weights_at_peaks()[:, None, :, None] * on_commands[:, None]
+        at_nodes = lagrange_weights(NODE_COUNT, PEAK_NODES)[:, None, :, None] * on_commands[:, None]
         on_forces = add_at(on_forces, commands, at_nodes)
     lengths = on_state.shape[0]
     return (
@@ -292,12 +289,6 @@ def _at_peak_nodes(propagators: Propagators):
         propagators.input_end[:, None],
     )
     return xp.concatenate(transitions, axis=1), xp.concatenate(responses, axis=1)
-
-
-def force_weights_at_peaks() -> np.ndarray:
-    """Weights (sample, force) that interpolate forces at the Gauss nodes to the peak nodes."""
-    powers = np.array(PEAK_NODES)[:, None] ** np.arange(NODE_COUNT)
-    return powers @ lagrange_coefficients(NODE_COUNT).T
 
 
 def bounds_by_energy(

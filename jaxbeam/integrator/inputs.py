@@ -111,16 +111,13 @@ def load_amplitude(case, model: ModalModel, loads: LoadSet) -> Float[Array, " ba
 
     Mode shapes are at most of the order 2 / sqrt(mass).
     """
-    weight = xp.sum(xp.abs(loads.varying_weight(_times_of(case))), axis=1)
+    times = case.run.duration * np.linspace(0.0, 1.0, 33)
+    weight = xp.sum(xp.abs(loads.varying_weight(times)), axis=1)
     stiffness = model.modes.stiffness
     elastic = stiffness > ELASTIC * model.modes.stiffness_unit
     compliance = xp.sum(xp.where(elastic, 1 / xp.where(elastic, stiffness, 1.0), 0.0))
     shape_square = 4 / (case.beam.linear_density * case.beam.length)
     return xp.max(weight, axis=0) * xp.sqrt(shape_square * compliance)
-
-
-def _times_of(case):
-    return case.run.duration * np.linspace(0.0, 1.0, 33)
 
 
 def has_feedback(policy) -> bool:

@@ -58,7 +58,7 @@ from jaxbeam.integrator.vehicles import (
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.numerics.polynomials import lagrange_coefficients
+from jaxbeam.numerics.polynomials import lagrange_weights
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
@@ -356,9 +356,9 @@ def peaks_of_halves(
     for half in range(2):
         parts = [state]
         if commands is not None:
-            powers = (0.5 * (half + GAUSS_NODES))[:, None] ** np.arange(NODE_COUNT)
+            weights = lagrange_weights(NODE_COUNT, 0.5 * (half + GAUSS_NODES))
             by_node = commands[index].reshape(index.size, NODE_COUNT, -1)
-            own = powers @ lagrange_coefficients(NODE_COUNT).T @ by_node
+            own = weights @ by_node
             parts.append(np.swapaxes(own.reshape(index.size, *commands.shape[1:]), 1, 2))
         sources.append(np.concatenate(parts, axis=2))
         state = maps.states.at(np.s_[half::2], sources[-1])

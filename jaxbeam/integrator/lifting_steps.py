@@ -32,12 +32,12 @@ from jaxbeam.integrator.load_path import END_FRACTIONS
 from jaxbeam.model.contact import solve_at_instants, surface_rows, vehicle_system
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.numerics.polynomials import lagrange_coefficients
+from jaxbeam.numerics.polynomials import lagrange_weights
 
 POINTS = np.array(PEAK_NODES)  # of a step: its start, the Gauss nodes, its end
 INSIDE = np.array([END_FRACTIONS[0], *GAUSS_NODES, END_FRACTIONS[1]])  # limits within the step
 NODES = slice(1, -1)  # the Gauss nodes among the points
-AT_POINTS = POINTS[:, None] ** np.arange(NODE_COUNT) @ lagrange_coefficients(NODE_COUNT).T
+AT_POINTS = lagrange_weights(NODE_COUNT, POINTS)
 NEWTON_ITERATIONS = 50
 NEWTON_TOLERANCE = 1e-13
 

@@ -30,7 +30,7 @@ from jaxbeam.integrator.discrete_model import (
 )
 from jaxbeam.integrator.inputs import MARK_COUNT
 from jaxbeam.integrator.load_path import END_FRACTIONS
-from jaxbeam.integrator.peaks import FORCE_FRACTIONS, Peaks, force_weights_at_fractions
+from jaxbeam.integrator.peaks import FORCE_FRACTIONS, FORCE_WEIGHTS, Peaks
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.integrator.vehicles import absorber_weights
 from jaxbeam.model.contact import initial_vehicle_states, may_have_kinks
@@ -72,7 +72,7 @@ def chosen_for(case: Case, runs: int) -> bool:
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
     plain = not has_settlement(case) and not may_have_kinks(case)
-    plain &= case.beam.torsional_rigidity is None  # wheels off the axis twist the beam
+    plain &= not case.beam.twists  # wheels off the axis twist the beam
     if case.controller is not None:  # accelerations would follow from the contact forces
         sampled = case.controller.period is not None
         plain &= sampled and not any(sensor.has_feedthrough for sensor in case.sensors)
@@ -388,7 +388,7 @@ def _constants() -> tuple[np.ndarray, ...]:
         interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
         np.asarray(PEAK_NODES),
         FORCE_FRACTIONS,
-        force_weights_at_fractions(),
+        FORCE_WEIGHTS,
         absorber_weights().reshape(-1, NODE_COUNT),
     )
     return tuple(np.ascontiguousarray(part, float)[None] for part in constants)

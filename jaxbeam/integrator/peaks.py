@@ -21,6 +21,7 @@ from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.numerics.polynomials import (
     estimate_peak,
     lagrange_coefficients,
+    lagrange_weights,
     locate_peak,
     max_with_ties,
     polynomial,
@@ -229,13 +230,9 @@ ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
 FORCE_FRACTIONS = np.interp(
     np.arange(2 * len(PEAK_NODES) - 1) / 2, np.arange(len(PEAK_NODES)), PEAK_NODES
 )
+# Weights (fraction, node) of contact forces at the Gauss nodes of a step.
+FORCE_WEIGHTS = lagrange_weights(NODE_COUNT, FORCE_FRACTIONS)
 FORCE_GAP = float(np.diff(FORCE_FRACTIONS).max())
-
-
-def force_weights_at_fractions() -> Float[np.ndarray, "fraction node"]:
-    """Weights that interpolate contact forces at the Gauss nodes of a step to FORCE_FRACTIONS."""
-    powers = FORCE_FRACTIONS[:, None] ** np.arange(NODE_COUNT)
-    return powers @ lagrange_coefficients(NODE_COUNT).T
 
 
 def spread_factor() -> float:
@@ -243,7 +240,7 @@ def spread_factor() -> float:
 
     It is half the Lebesgue constant of the Gauss nodes, which is reached at the ends of the step.
     """
-    return 0.5 * float(np.abs(force_weights_at_fractions()).sum(axis=1).max())
+    return 0.5 * float(np.abs(FORCE_WEIGHTS).sum(axis=1).max())
 
 
 def contact_minimum(
@@ -309,8 +306,8 @@ def _at_fractions(by_row: Float[Array, "step row node batch"], by_product: bool)
     which makes a smaller program.
     """
     if by_product:
-        return xp.einsum("fn,slnb->fslb", force_weights_at_fractions(), by_row)
-    weights = force_weights_at_fractions()[..., None, None, None]
+        return xp.einsum("fn,slnb->fslb", FORCE_WEIGHTS, by_row)
+    weights = FORCE_WEIGHTS[..., None, None, None]
     return sum(weights[:, node] * by_row[:, :, node] for node in range(NODE_COUNT))
 
 

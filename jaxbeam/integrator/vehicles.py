@@ -313,10 +313,10 @@ def absorber_weights() -> Float[np.ndarray, "2 sample node"]:
 
     Of the force itself, and of the displacement of a unit mass that is at zero at both ends.
     """
-    powers, coefficients = np.arange(NODE_COUNT), lagrange_coefficients(NODE_COUNT)
+    powers = np.arange(NODE_COUNT)
     c = np.array(PEAK_NODES)[:, None]
     twice = (c ** (powers + 2) - c) / ((powers + 1) * (powers + 2))
-    return np.stack([c**powers @ coefficients.T, twice @ coefficients.T])
+    return np.stack([c**powers, twice]) @ lagrange_coefficients(NODE_COUNT).T
 
 
 def absorber_samples(

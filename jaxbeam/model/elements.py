@@ -74,6 +74,14 @@ def largest_layout(layouts: Sequence[Layout]) -> Layout | None:
     return common[0] if all(one == common[0] for one in common) else None
 
 
+def held_positions(case: Case) -> Float[np.ndarray, " support"]:
+    """Positions (m) at which ends and supports hold the deflection, from left to right."""
+    length = float(concrete(case.beam.length))
+    ends = (0.0, case.beam.left_end), (length, case.beam.right_end)
+    held = {x for x, end in ends if END_CONDITIONS[end][0]}
+    return np.array(sorted(held | {float(concrete(s.position)) for s in case.supports}))
+
+
 def is_uniform(case: Case) -> bool:
     """Whether the beam is an Euler-Bernoulli beam of uniform section without bearings of mass."""
     return case.beam.is_uniform and all(support.mass is None for support in case.supports)

@@ -42,7 +42,7 @@ from jaxbeam.model.elements import (
     section_fields,
     sections,
 )
-from jaxbeam.model.torsion import TorsionMatrices, torsion_matrices, twists
+from jaxbeam.model.torsion import TorsionMatrices, torsion_matrices
 from jaxbeam.model.track import layers
 from jaxbeam.model.transfer_matrices import check_buckling
 from jaxbeam.numerics.matrices import REPEATED_EIGENVALUE_TOLERANCE, eigen
@@ -337,7 +337,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         found = sections(case, layout)
         nodes = found.nodes
         stiffness, mass, to_series, to_rotation = assemble_sections(case, layout, found)
-    if twists(case):
+    if case.beam.twists:
 
         def density(element: int, positions):
             if found is None:

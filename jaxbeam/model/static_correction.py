@@ -26,7 +26,6 @@ from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
-from jaxbeam.model.torsion import twists
 from jaxbeam.runtime.arrays import Array, is_numpy, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
@@ -143,7 +142,7 @@ def corrected_history(
 def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layout):
     """Residual of the modes under the contact forces, (time, *position)."""
     on_beam = xp.isfinite(motion.load_position)  # wheels of vehicles press on the ground, too
-    arms = load_set(case, layout).eccentricity if twists(case) else None
+    arms = load_set(case, layout).eccentricity if case.beam.twists else None
     if not all(map(is_numpy, jax.tree.leaves((case, motion, x)))):
         positions = xp.where(on_beam, motion.load_position, 0.0)
         residual = _under_loads(case, x, positions, derivative, layout, arms)
@@ -165,7 +164,7 @@ def _under_loads(case: Case, x, positions, derivative: int, layout: Layout, arms
 
     `arms` are their eccentricities (m), which are broadcast to the positions.
     """
-    if case.track is None and not twists(case):
+    if case.track is None and not case.beam.twists:
         return _residual_flexibility(case, x, positions, derivative, layout)
     return _spread_residual(case, layout, x, positions, derivative, arms)
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.fields import check_on_beam, concrete, suggestion
 from jaxbeam.case.sensors import QUANTITIES, SIDES, SLOPE, quantity_of
@@ -23,7 +22,7 @@ from jaxbeam.model.deflection_lines import (
     unchecked_influence_line,
     validated_layout,
 )
-from jaxbeam.model.elements import Layout, is_uniform
+from jaxbeam.model.elements import Layout, held_positions, is_uniform
 from jaxbeam.model.output_rows import SIDE_DISTANCE, at_side, quantity_factor
 from jaxbeam.model.static_correction import section_stiffness
 from jaxbeam.model.transfer_matrices import settlement_response
@@ -228,14 +227,6 @@ def _reaction_line(case: Case, x, field):
         return total
 
     return line, xp.concatenate(breaks)
-
-
-def held_positions(case: Case) -> Float[np.ndarray, " support"]:
-    """Positions (m) at which ends and supports hold the deflection, from left to right."""
-    length = float(concrete(case.beam.length))
-    ends = (0.0, case.beam.left_end), (length, case.beam.right_end)
-    held = {x for x, end in ends if END_CONDITIONS[end][0]}
-    return np.array(sorted(held | {float(concrete(s.position)) for s in case.supports}))
 
 
 def _check_held(case: Case, x) -> None:

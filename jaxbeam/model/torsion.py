@@ -27,11 +27,6 @@ from jaxbeam.numerics.polynomials import legendre_to_chebyshev
 from jaxbeam.runtime.arrays import Array, Module, add_at, set_at, take, xp
 
 
-def twists(case: Case) -> bool:
-    """Whether the beam of a case has a torsional rigidity."""
-    return case.beam.torsional_rigidity is not None
-
-
 def _holds(case: Case, layout: Layout) -> tuple[list[bool], list[tuple[int, Array]]]:
     """Whether the twist of each node is held, and pairs of a node and a spring on it (N m/rad)."""
     held, springs = [], []
@@ -164,7 +159,7 @@ def twist_flexibility(
     Raises ValueError for a beam that does not twist.
     """
     beam = case.beam
-    if beam.torsional_rigidity is None:
+    if not beam.twists:
         raise ValueError(NO_TORSION)
     positions = xp.stack([place / beam.length for place in node_positions(case)])
     nodes = positions[np.array([node[0] for node in layout.nodes])]

@@ -1,6 +1,7 @@
 """Polynomials: Gauss-Legendre quadrature, piecewise Chebyshev series, peaks between samples."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -63,6 +64,21 @@ def lagrange_coefficients(count: int) -> Float[np.ndarray, "node power"]:
         others = np.delete(nodes, k)
         polynomials.append(np.polynomial.polynomial.polyfromroots(others) / np.prod(node - others))
     return np.array(polynomials)
+
+
+def lagrange_weights(count: int, fractions) -> Float[np.ndarray, "fraction node"]:
+    """Weights that interpolate values at the nodes to fractions of the interval."""
+    return np.vander(fractions, count, increasing=True) @ lagrange_coefficients(count).T
+
+
+@functools.cache
+def shift_weights(count: int) -> Float[np.ndarray, "power power"]:
+    """Weights 1 / (p - q)!: coefficient p of (1 + s)^p / p! in s^q / q!.
+
+    So are those of phi_q in phi_p of the doubled argument.
+    """
+    rows = range(count)
+    return np.array([[1 / math.factorial(p - q) if q <= p else 0.0 for q in rows] for p in rows])
 
 
 @functools.cache

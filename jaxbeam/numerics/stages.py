@@ -48,6 +48,7 @@ from jaxbeam.numerics.polynomials import (
     integration_matrix,
     lagrange_coefficients,
     powers,
+    shift_weights,
 )
 from jaxbeam.runtime.arrays import (
     Array,
@@ -568,7 +569,7 @@ def _double_phi(transition, input_responses):
     """Exponentials and phi functions (fraction, phi, state, input) of the doubled argument."""
     halves = 0.5 ** np.arange(1, NODE_COUNT + 1)
     doubled = transition[:, None] @ input_responses + xp.einsum(
-        "pq,cqik->cpik", _second_half_matrix().T, input_responses
+        "pq,cqik->cpik", shift_weights(NODE_COUNT), input_responses
     )
     return transition @ transition, doubled * halves[:, None, None]
 
@@ -580,7 +581,7 @@ def _double_cost(transition, input_responses, cost, count):
     first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
     scale = np.append(np.ones(states), np.repeat(first, count))
     # (coefficient over the second, coefficient over both)
-    second_half_weights = _second_half_matrix() * first
+    second_half_weights = shift_weights(NODE_COUNT).T * first
 
     def to_second_half(columns):
         """Columns for coefficients over the second interval, as columns for those over both."""
@@ -607,10 +608,3 @@ def _double_cost(transition, input_responses, cost, count):
 def _flatten_columns(input_responses):
     """Responses (power, state, input) as columns (state, power and input)."""
     return xp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
-
-
-@functools.cache
-def _second_half_matrix() -> np.ndarray:
-    """Weights 1 / (q - p)!: coefficient q of (1 + s)^q / q! in s^p / p!."""
-    rows = range(NODE_COUNT)
-    return np.array([[1 / math.factorial(q - p) if q >= p else 0.0 for q in rows] for p in rows])

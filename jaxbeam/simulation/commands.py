@@ -19,7 +19,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensor_signals import ROUNDED
-from jaxbeam.numerics.polynomials import lagrange_coefficients
+from jaxbeam.numerics.polynomials import lagrange_weights
 from jaxbeam.runtime.arrays import (
     Array,
     Module,
@@ -332,7 +332,7 @@ def _outputs(operators, states, commands) -> Commands:
 
 POINTS = 128  # within a step, at which voltages are compared with their limits
 _FRACTIONS = (np.arange(POINTS) + 0.5) / POINTS
-TO_POINTS = np.vander(_FRACTIONS, NODE_COUNT, increasing=True) @ lagrange_coefficients(NODE_COUNT).T
+TO_POINTS = lagrange_weights(NODE_COUNT, _FRACTIONS)
 FROM_POINTS = np.linalg.pinv(TO_POINTS)
 
 

@@ -14,7 +14,6 @@ from jaxbeam.files.netcdf import check_codecs
 from jaxbeam.model.elements import Layout, is_uniform, sections
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout, modes
-from jaxbeam.model.torsion import twists
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
 from jaxbeam.simulation.record import Record
@@ -79,7 +78,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
             sections=None if is_uniform(case) else sections(case, layout),
             rotation_series=_rotation_series(dataset, case, layout),
             twist_series=(
-                xp.asarray(dataset["mode_twist_series"].values) if twists(case) else None
+                xp.asarray(dataset["mode_twist_series"].values) if case.beam.twists else None
             ),
         ),
         times=xp.asarray(dataset["time"].values),

@@ -38,9 +38,9 @@ from jaxbeam.integrator.lifting_steps import (
 )
 from jaxbeam.integrator.peaks import (
     FORCE_FRACTIONS,
+    FORCE_WEIGHTS,
     RunningPeaks,
     contact_minimum,
-    force_weights_at_fractions,
     initial_peaks,
     peaks_of_steps,
 )
@@ -65,7 +65,6 @@ SAME_TIME = 1e-12  # of the duration of a run
 MAX_EVENTS = 20000
 MAX_TRIALS = 40  # cuts of a step until it ends at an event
 CHUNK_ENTRIES = 2**22  # of the largest array of the steps that are prepared together
-OF_FORCES = force_weights_at_fractions()
 _OF_POINTS = np.linalg.inv(POINTS[:, None] ** np.arange(POINTS.size))
 SLOPE_AT_END = np.arange(POINTS.size) @ _OF_POINTS  # derivative at 1, of values at the points
 OF_POINTS = FORCE_FRACTIONS[:, None] ** np.arange(POINTS.size) @ _OF_POINTS
@@ -230,7 +229,7 @@ class _LiftingRun:
         by_force = piece.pressing & ~self.law.sprung
         sign = np.where(piece.pressing, -1.0, 1.0)[:, None] / self.gap_scale
         values = sign * piece.gap @ OF_POINTS.T
-        values[by_force] = piece.force[by_force] @ OF_FORCES.T / self.force_scale
+        values[by_force] = piece.force[by_force] @ FORCE_WEIGHTS.T / self.force_scale
         below = (values < -1.0) & (self.law.contact & ~self.law.held)[:, None]
         for fraction in np.flatnonzero(below.any(axis=0)):
             found = []

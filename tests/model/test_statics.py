@@ -17,7 +17,7 @@ from jaxbeam.case.actuators.point import Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import kinds
-from jaxbeam.case.loads.base import AbstractLoad, trajectory
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.model.deflection_lines import influence_line, static_deflection
 from jaxbeam.model.modes import mesh_layout
@@ -141,7 +141,7 @@ def sampled_peak(case: Case, x, until: float) -> np.ndarray:
     times, total = np.linspace(0.0, until, 40001), 0.0
     length = float(case.beam.length)
     for load in case.loads:
-        path = trajectory(load, case.beam.length)
+        path = load.trajectory(case.beam.length)
         position = np.clip(np.asarray(path.kinematics(times)[0]), 0.0, length)
         entry, leave = (float(t) for t in path.entry_exit_times())
         line = np.asarray(influence_line(case, x, position))

@@ -253,11 +253,6 @@ class AbstractVehicleLoad(AbstractLoad):
     )
 
 
-def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewiseTrajectory:
-    """Trajectory of a load along a beam of a length (m)."""
-    return load.trajectory(length)
-
-
 def wheel_distances(load: Any, vehicle: VehicleModel) -> Float[Array, " wheel"]:
     """Distances (m) of all wheels of a load or an absorber behind its first one, given vehicles."""
     return (load.spacings()[:, None] + vehicle.offsets).reshape(-1)

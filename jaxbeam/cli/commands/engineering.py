@@ -265,7 +265,8 @@ def _sections(case: "jb.Case", quantity: str, at: tuple[str, ...]) -> tuple[dict
     """Names of characteristic points by position (m), and positions of sections of a quantity."""
     from jaxbeam.analysis.sections import characteristic_points
     from jaxbeam.case.toml_file import number_in_si
-    from jaxbeam.model.statics import REACTION, held_positions
+    from jaxbeam.model.elements import held_positions
+    from jaxbeam.model.statics import REACTION
 
     places = {point.x: point.name for point in characteristic_points(case)}
     given = [number_in_si(text, "m", "--at") for text in at]

@@ -15,9 +15,9 @@ from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.elements import held_positions
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.statics import held_positions
 
 POSITIONS, TIMES = 201, 501
 
