@@ -12,6 +12,7 @@ of the regression widen the distribution that it is compared with.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from tuning.monitoring.history import ModeTrack
 WEIGHT = 0.2  # of the newest log in the moving average, usual for changes of about one deviation
 MIN_FREE = 10  # logs more than coefficients, which a regression needs
 CLIPPED = 3.0  # deviations; a log that is farther off is an outlier, not a change
+ABSURD = 30.0  # robust deviations of a condition, beyond which its sensor has failed
 OUTLIER = 4.0  # robust deviations, beyond which a log is left out of the regression
 MAX_ROUNDS = 5
 LEAST_CHANCE = 1e-300  # of a statistic, whose quantile would be infinite below
@@ -130,10 +132,18 @@ def chart_of(
 
 
 def _columns(conditions: Sequence[Mapping[str, float]], baseline: int):
-    """Names of the conditions that change in the baseline, and their values (log, condition)."""
+    """Names of the conditions that change in the baseline, and their values (log, condition).
+
+    Those beyond what the baseline has by far, as -9999 of a sensor that failed, are NaN.
+    """
     names = list(dict.fromkeys(name for one in conditions for name in one))
     table = np.array([[one.get(name, np.nan) for name in names] for one in conditions])
     table = table.reshape(len(conditions), len(names))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of a condition that no log has
+        off = np.abs(table - np.nanmedian(table[:baseline], axis=0))
+        usual = 1.4826 * np.nanmedian(off[:baseline], axis=0)
+    table = np.where((usual > 0) & (off > ABSURD * usual), np.nan, table)
     own = table[:baseline]
     known = np.isfinite(own).sum(axis=0) >= MIN_FREE
     with np.errstate(all="ignore"):

@@ -1,6 +1,7 @@
 """Modes of each log of a folder, kept in a file so that only new logs are analysed; tracks."""
 
 import concurrent.futures
+import concurrent.futures.process
 import csv
 import dataclasses
 import json
@@ -8,7 +9,7 @@ import multiprocessing
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,7 +64,8 @@ class LogModes(NamedTuple):
 
     `start` is the date and time of the first sample, "" if the log has none; `conditions` are means
     of columns such as temperatures, by name. `problem` is the sentence why there are no modes, if
-    there are none; `mark` tells a log from one that was changed.
+    there are none; `mark` tells a log from one that was changed. `channels` are the names of those
+    that shapes have; without, shapes are compared by their places.
     """
 
     file: str
@@ -75,6 +77,7 @@ class LogModes(NamedTuple):
     shapes: Complex[np.ndarray, "mode channel"] = np.zeros((0, 0), complex)
     conditions: Mapping[str, float] = {}
     problem: str = ""
+    channels: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON."""
@@ -97,7 +100,8 @@ class LogModes(NamedTuple):
         real, imag = (part.reshape(part.shape if part.size else (0, 0)) for part in parts)
         words = {name: content[name] for name in ("file", "mark", "start", "problem")}
         conditions = {name: float(value) for name, value in content["conditions"].items()}
-        return cls(**words, **arrays, shapes=real + 1j * imag, conditions=conditions)
+        shapes, channels = real + 1j * imag, tuple(content.get("channels", ()))
+        return cls(**words, **arrays, shapes=shapes, conditions=conditions, channels=channels)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,21 +145,21 @@ def analyse(
 
     The store, a JSON file, is written after each log. The `settings` say which files are logs, but
     descriptions (.toml) and hidden ones, and how they are analysed. Logs that cannot be analysed
-    have an entry with the reason. More than one of the `processes` need a program whose main module
-    may be imported; a bar shows `progress`.
+    have an entry with the reason; those that have left the folder keep theirs. More than one of the
+    `processes` need a program whose main module may be imported; a bar shows `progress`.
 
     Raises FileNotFoundError without the folder, that of the store, or a log, ValueError for a store
-    of other settings.
+    of other settings or of another folder, ChildProcessError if a process is ended from outside.
     """
     folder, store, settings = Path(folder), Path(store), settings or AnalysisSettings()
-    told = settings.to_dict()
+    told = settings.to_dict() | {"folder": str(folder.resolve())}
     files = logs_in(folder, settings.pattern, store)
     if not store.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
     known: dict[str, LogModes] = {}
     if store.exists():
         former = read_history(store)
-        changed = [k for k, v in told.items() if former.settings.get(k) != v]
+        changed = [k for k, v in settings.to_dict().items() if former.settings.get(k) != v]
         if changed:
             raise ValueError(
                 f"{store} was made with another {changed[0]}"
@@ -163,16 +167,45 @@ def analyse(
                 " same, or another store"
             )
         known = {entry.file: entry for entry in former.entries}
-    marks = {path.name: version_of(path) for path in files}
-    known = {name: one for name, one in known.items() if marks.get(name) == one.mark}
-    left = [path for path in files if path.name not in known]
+        other = former.settings.get("folder") != told["folder"]
+        if known and other and not any((folder / name).is_file() for name in known):
+            raise ValueError(f"{store} has logs of another folder than {folder}: give another")
+    marks = {path.relative_to(folder).as_posix(): version_of(path) for path in files}
+    known = {name: one for name, one in known.items() if marks.get(name, one.mark) == one.mark}
+    known = {name: one for name, one in known.items() if one.channels or one.problem}
+    left = [path for path in files if path.relative_to(folder).as_posix() not in known]
     kept = keeping(lambda: f"{len(known)} of {len(files)} logs are in {store}: go on by the same")
-    with ProgressBar(len(files), "log", shown=progress, initial=len(known)) as bar, kept:
-        for entry in _analysed(left, settings, processes):
-            known[entry.file] = entry
-            _history(known, told).save(store)
+    with (
+        ProgressBar(len(files), "log", shown=progress, initial=len(files) - len(left)) as bar,
+        kept,
+    ):
+        for path, entry in _analysed(left, settings, processes):
+            name = path.relative_to(folder).as_posix()
+            known[name] = entry._replace(file=name)
+            _history(_without_repeats(known, marks), told).save(store)
             bar.update()
-    return _history(known, told)
+    return _history(_without_repeats(known, marks), told)
+
+
+def _without_repeats(known: Mapping[str, LogModes], present: Container[str]) -> dict[str, LogModes]:
+    """Entries of which those with the modes of another, to nine digits, have none.
+
+    Such a log is a copy, or one that has been renamed: of the latter only the one that is `present`
+    is kept.
+    """
+    found: dict[str, LogModes] = {}
+    first: dict[tuple, str] = {}
+    for name in sorted(known, key=lambda name: name not in present):
+        entry = known[name]
+        numbers = (*entry.frequencies.tolist(), *entry.damping_ratios.tolist())
+        key = (entry.start, *(f"{number:.9g}" for number in numbers))
+        other = first.setdefault(key, name) if numbers else name
+        if other == name:
+            found[name] = entry
+        elif name in present:
+            none = LogModes(name, entry.mark, entry.start)
+            found[name] = none._replace(problem=f"it is a copy of {other}")
+    return found
 
 
 def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
@@ -195,7 +228,7 @@ def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
 def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> ModeHistory:
     """ModeHistory of entries by the time of their first samples, or else by their names.
 
-    Logs without a date that could not be analysed follow the one before them by name.
+    Logs without a date that have no modes follow the one before them by name.
     """
 
     def by_name(entry: LogModes):
@@ -213,17 +246,22 @@ def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> Mode
 
 def _analysed(
     paths: Sequence[Path], settings: AnalysisSettings, processes: int
-) -> Iterable[LogModes]:
-    """Entries of some logs, as they are found."""
+) -> Iterable[tuple[Path, LogModes]]:
+    """Paths and entries of some logs, as they are found."""
     if processes <= 1 or len(paths) < 2:
-        yield from (entry_of(path, settings) for path in paths)
+        yield from ((path, entry_of(path, settings)) for path in paths)
         return
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(min(processes, len(paths)), context) as pool:
-        futures = [pool.submit(entry_of, path, settings) for path in paths]
+        futures = {pool.submit(entry_of, path, settings): path for path in paths}
         try:
             for future in concurrent.futures.as_completed(futures):
-                yield future.result()
+                yield futures[future], future.result()
+        except concurrent.futures.process.BrokenProcessPool:
+            raise ChildProcessError(
+                "a process that analyses logs was ended from outside, as for want of memory: go on"
+                " by the same call with fewer processes"
+            ) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
@@ -256,6 +294,7 @@ def entry_of(path: Path, settings: AnalysisSettings) -> LogModes:
         np.array([mode.shape for mode in modes], complex).reshape(len(modes), count),
         dict(log.conditions),
         "" if modes else "no mode is well identified",
+        tuple(fit.channels.names),
     )
 
 
@@ -276,20 +315,25 @@ def read_conditions(path: str | os.PathLike) -> dict[str, dict[str, float]]:
             raise ValueError(f"{path}, line {number}: a condition is no number") from None
         if len(values) != len(head) - 1:
             raise ValueError(f"{path}, line {number}: it has {len(row)} cells, not {len(head)}")
-        known[Path(row[0].strip()).name] = dict(zip(map(str.strip, head[1:]), values, strict=True))
+        known[Path(row[0].strip()).as_posix()] = dict(
+            zip(map(str.strip, head[1:]), values, strict=True)
+        )
     return known
 
 
 def with_conditions(history: ModeHistory, known: Mapping[str, Mapping[str, float]]) -> ModeHistory:
     """The history with conditions, by the names of logs, beside those of the logs themselves.
 
-    Raises ValueError if they are those of none of its logs.
+    Names may leave out folders. Raises ValueError if they are those of none of its logs.
     """
-    if not any(entry.file in known for entry in history.entries):
+    files = {entry.file for entry in history.entries}
+    by_name = {Path(file).name: own for file, own in known.items() if file not in files}
+    own = [known.get(one.file, by_name.get(Path(one.file).name)) for one in history.entries]
+    if not any(own):
         raise ValueError("the table of conditions names no log of the folder in its first column")
     entries = tuple(
-        entry._replace(conditions={**entry.conditions, **known.get(entry.file, {})})
-        for entry in history.entries
+        entry._replace(conditions={**entry.conditions, **(new or {})})
+        for entry, new in zip(history.entries, own, strict=True)
     )
     return dataclasses.replace(history, entries=entries)
 
@@ -342,7 +386,8 @@ class _GrowingTrack:
         turned = shape * (phase / abs(phase) if abs(phase) > 0 else 1.0)
         scale = np.linalg.norm(turned[both]) or 1.0
         mixed = (1 - SHAPE_WEIGHT) * self.shape + SHAPE_WEIGHT * turned / scale
-        self.shape = np.where(np.isfinite(mixed), mixed, self.shape)
+        former = np.where(np.isfinite(self.shape), self.shape, turned / scale)
+        self.shape = np.where(np.isfinite(mixed), mixed, former)
         self.logs.append(log)
         self.modes.append(mode)
         self.mac.append(mac)
@@ -354,8 +399,9 @@ def tracks_of(entries: Sequence[LogModes]) -> list[ModeTrack]:
 
     Modes of a log are assigned to the tracks so that changes of frequency and shape (MAC) are least
     in sum; a mode without a track begins one, a track without a mode for GONE logs has ended. Those
-    seen too seldom are left out.
+    seen too seldom are left out. Shapes are compared on the channels that both have.
     """
+    entries = _on_all_channels(entries)
     growing: list[_GrowingTrack] = []
     for number, entry in enumerate(entries):
         alive = [track for track in growing if number - track.logs[-1] <= GONE]
@@ -365,7 +411,8 @@ def tracks_of(entries: Sequence[LogModes]) -> list[ModeTrack]:
                 track, mac = taken[mode]
                 alive[track].add(number, mode, entry, mac)
                 continue
-            shape = entry.shapes[mode] / (np.linalg.norm(entry.shapes[mode]) or 1.0)
+            size = np.sqrt(np.nansum(np.abs(entry.shapes[mode]) ** 2))
+            shape = entry.shapes[mode] / (size or 1.0)
             frequency = float(entry.frequencies[mode])
             growing.append(_GrowingTrack([number], [mode], [1.0], [frequency], shape))
     tracks = [_finished(track, entries) for track in growing]
@@ -378,22 +425,42 @@ def tracks_of(entries: Sequence[LogModes]) -> list[ModeTrack]:
     return sorted(kept, key=lambda track: float(np.nanmedian(track.frequencies)))
 
 
+def _on_all_channels(entries: Sequence[LogModes]) -> list[LogModes]:
+    """Entries with shapes on all channels of all logs, by name; NaN where a log has none.
+
+    Logs with as many channels, but all of other names, have the same in the same order.
+    """
+    places: dict[str, int] = {}
+    found, before = [], ()
+    for entry in entries:
+        own = entry.channels or tuple(map(str, range(entry.shapes.shape[1])))
+        if len(own) == len(before) and not places.keys() & set(own):
+            own = before
+        for name in own:
+            places.setdefault(name, len(places))
+        found.append(own)
+        before = own or before
+    wide = []
+    for entry, own in zip(entries, found, strict=True):
+        shapes = np.full((entry.frequencies.size, len(places)), np.nan, complex)
+        if entry.frequencies.size:
+            shapes[:, [places[name] for name in own]] = entry.shapes
+        wide.append(entry._replace(shapes=shapes))
+    return wide
+
+
 def _assigned(entry: LogModes, alive: Sequence[_GrowingTrack]) -> dict[int, tuple[int, float]]:
     """ModeTrack and MAC of each mode of a log that continues one."""
     if not alive or not entry.frequencies.size:
         return {}
-    sizes = [track.shape.size for track in alive]
-    fits = [i for i, size in enumerate(sizes) if size == entry.shapes.shape[1]]
-    if not fits:
-        return {}
-    before = np.array([np.median(alive[i].recent) for i in fits])
+    before = np.array([np.median(track.recent) for track in alive])
     steps = np.abs(np.log(entry.frequencies[:, None] / before)) / np.log1p(MAX_STEP)
-    mac = mac_matrix(entry.shapes, np.array([alive[i].shape for i in fits]))
+    mac = mac_matrix(entry.shapes, np.array([track.shape for track in alive]))
     allowed = (steps <= 1) & (mac >= MIN_MAC)
     cost = np.where(allowed, steps + (1 - mac) / (1 - MIN_MAC), 1e3)
     rows, columns = scipy.optimize.linear_sum_assignment(cost)
     return {
-        int(row): (fits[column], float(mac[row, column]))
+        int(row): (int(column), float(mac[row, column]))
         for row, column in zip(rows, columns, strict=True)
         if allowed[row, column]
     }

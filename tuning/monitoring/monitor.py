@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from jaxbeam.plot.style import ALARM, GREY, LIMIT_STYLE, colour, use_style
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, text_table
+from tuning.logs.readers.headings import epoch_seconds
 from tuning.monitoring.chart import ControlChart, chart_of
 from tuning.monitoring.history import (
     AnalysisSettings,
@@ -98,13 +99,16 @@ class Monitoring(TableViews):
         if not self.tracks:
             return f"no mode is found in enough of {len(entries)} logs to be followed"
         followed = f"{len(self.tracks)} mode{'s' * (len(self.tracks) > 1)} followed in"
-        followed = "; ".join([f"{followed} {len(entries)} logs", *self.come_and_gone])
+        followed = "; ".join(
+            [f"{followed} {len(entries)} logs", *self._undated, *self.come_and_gone]
+        )
         if chart is None:
             return (
                 f"{followed}; no control chart: no mode is in enough of the first {self.baseline}"
                 " logs (the baseline), with the conditions of the others"
             )
         after = int(np.isfinite(chart.statistic[self.baseline :]).sum())
+        followed = "; ".join([followed, *self._untold])
         if chart.since is not None:
             changes = [
                 f"{_frequency(self.tracks[i]):.4g} Hz by {100 * value:+.2f} +- {100 * half:.2f} %"
@@ -119,9 +123,33 @@ class Monitoring(TableViews):
         passing = int(chart.alarm.sum())
         expected = chart.false_alarms * after
         return (
-            f"{followed}; no alarm in the last of {after} logs after the baseline of"
+            f"{followed}; the chart has no alarm in the last of {after} logs after the baseline of"
             f" {self.baseline}; {passing} passed, {expected:.1f} are expected without a change"
         )
+
+    @property
+    def _undated(self) -> list[str]:
+        """Sentence on the order of logs of which some only have a date."""
+        known = [one for one in self.history.entries if not one.problem]
+        undated = [one.file for one in known if not epoch_seconds(one.start)]
+        if len(undated) in (0, len(known)):
+            return []
+        return [f"the order is that of names, as {undated[0]} has no date"]
+
+    @property
+    def _untold(self) -> list[str]:
+        """Sentence on logs with modes after the baseline of which the chart tells nothing."""
+        entries, chart = self.history.entries, self.chart
+        if chart is None:
+            return []
+        silent = [
+            entries[i]
+            for i in range(self.baseline, len(entries))
+            if entries[i].frequencies.size and np.isnan(chart.statistic[i])
+        ]
+        why = f", {' or '.join(chart.conditions)} being unknown or far from all others"
+        said = f"{len(silent)} logs after the baseline, as {{}}, tell nothing"
+        return [said.format(silent[0].file) + why * bool(chart.conditions)] if silent else []
 
     @property
     def come_and_gone(self) -> list[str]:

@@ -5,6 +5,8 @@ of oscillators that scipy integrates.
 """
 
 import json
+import os
+import signal
 import subprocess
 import sys
 
@@ -13,6 +15,7 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 
+from tuning.logs.reading import version_of
 from tuning.monitoring.history import (
     AnalysisSettings,
     LogModes,
@@ -21,6 +24,7 @@ from tuning.monitoring.history import (
     read_conditions,
     read_history,
     tracks_of,
+    with_conditions,
 )
 from tuning.monitoring.monitor import monitor, monitored
 
@@ -121,6 +125,62 @@ def test_modes_are_born_and_end():
     ]  # fmt: skip
 
 
+def with_shapes(entry, shapes, channels):
+    return entry._replace(shapes=shapes, channels=channels)
+
+
+@pytest.mark.parametrize("kind", ["in another order", "one lost", "renamed", "one new"])
+def test_channels_are_known_by_their_names(kind):
+    """Of the planted history with named channels, of which those after the hundredth log differ."""
+    entries = []
+    for i, one in enumerate(history(3).entries):
+        named = with_shapes(one, one.shapes, ("a", "b", "c"))
+        if i >= 100 and kind == "in another order":
+            named = with_shapes(one, one.shapes[:, ::-1], ("c", "b", "a"))
+        if i >= 100 and kind == "one lost":
+            named = with_shapes(one, one.shapes[:, :2], ("a", "b"))
+        if i >= 100 and kind == "renamed":
+            named = with_shapes(one, one.shapes, ("x", "y", "z"))
+        if i >= 100 and kind == "one new":
+            wide = np.column_stack([0.7 * one.shapes[:, 0], one.shapes])
+            named = with_shapes(one, wide, ("n", "a", "b", "c"))
+        entries.append(named)
+    found, exact = tracks_of(entries), tracks_of(history(3).entries)
+    assert len(found) == 3
+    for one, other in zip(found, exact, strict=True):
+        assert_allclose(one.frequencies, other.frequencies)
+
+
+def test_logs_without_the_temperature_are_told():
+    """The logger of temperatures fails after the baseline; the chart would be silent for ever."""
+    planted = history(5, loss=0.05)
+    entries = [
+        one if i < 120 else one._replace(conditions={}) for i, one in enumerate(planted.entries)
+    ]
+    verdict = monitored(ModeHistory(tuple(entries), {}), baseline=100).verdict
+    assert "80 logs after the baseline, as 120.csv, tell nothing, T (°C) being unknown" in verdict
+
+
+def test_a_temperature_of_a_failed_sensor_is_none():
+    """-9999 in one log of the baseline would hide the effect of the temperature."""
+    entries = list(history(6, loss=0.01).entries)
+    for i in (20, 120):
+        entries[i] = entries[i]._replace(conditions={"T (°C)": -9999.0})
+    found = monitored(ModeHistory(tuple(entries), {}), baseline=100)
+    assert found.chart is not None and found.chart.since is not None
+    assert np.isnan(found.chart.statistic[[20, 120]]).all()
+    for own in found.chart.regressions:
+        assert own.effects[0].slope == pytest.approx(PER_KELVIN, abs=3e-4)
+
+
+def test_a_log_without_a_date_among_others_is_told():
+    entries = history(7).entries
+    dated = [one._replace(start=f"2026-10-01T00:{i // 60:02}:00") for i, one in enumerate(entries)]
+    dated[3] = dated[3]._replace(start="")
+    verdict = monitored(ModeHistory(tuple(dated), {}), baseline=100).verdict
+    assert "the order is that of names, as 003.csv has no date" in verdict
+
+
 def write_log(path, seed, warm, loss=0.0, seconds=120.0, rate=50.0):
     """An ambient log of three channels, with its temperature in a column."""
     rng = np.random.default_rng(seed)
@@ -183,6 +243,65 @@ def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
     assert not (tmp_path / "unwritten.json").exists()  # before any work
     with pytest.raises(FileNotFoundError, match="there is no folder .*nowhere to write"):
         monitor(logs, tmp_path / "nowhere" / "modes.json")
+
+
+def planted_modes(path, _):
+    """Modes of a file that holds their frequency, instead of an analysis."""
+    frequency = np.array([float(path.read_text())])
+    parts = frequency, 1e-3 * frequency, 0.01 * np.ones(1), np.ones((1, 1), complex)
+    return LogModes(path.name, version_of(path), "", *parts, channels=("a",))
+
+
+def test_logs_that_are_moved_away_renamed_or_copied(tmp_path, monkeypatch):
+    """The baseline stays; a log counts once."""
+    monkeypatch.setattr("tuning.monitoring.history.entry_of", planted_modes)
+    folder, store = tmp_path / "bridge", tmp_path / "modes.json"
+    folder.mkdir()
+    for i in range(6):
+        (folder / f"{i}.csv").write_text(f"{2 + 0.1 * i}")
+    analyse(folder, store)
+    (folder / "0.csv").unlink()
+    (folder / "1.csv").rename(folder / "1b.csv")
+    (folder / "5b.csv").write_text((folder / "5.csv").read_text())
+    (folder / "6.csv").write_text("2.6")
+    found = {one.file: one for one in analyse(folder, store).entries}
+    assert list(found) == ["0.csv", "1b.csv", *(f"{i}.csv" for i in range(2, 6)), "5b.csv", "6.csv"]
+    assert found["5b.csv"].problem == "it is a copy of 5.csv" and not found["5b.csv"].channels
+    assert [one.frequencies.tolist() for one in found.values() if not one.problem] == [
+        [pytest.approx(2 + 0.1 * i)] for i in range(7)
+    ]
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "7.csv").write_text("2.7")
+    with pytest.raises(ValueError, match=r"modes.json has logs of another folder than .*other"):
+        analyse(other, store)
+
+
+def test_logs_of_one_name_in_several_folders(tmp_path, monkeypatch):
+    """A folder a day, each with a run1.csv; conditions by the path, or by the name."""
+    monkeypatch.setattr("tuning.monitoring.history.entry_of", planted_modes)
+    for day in range(1, 4):
+        (tmp_path / f"logs/day{day}").mkdir(parents=True)
+        (tmp_path / f"logs/day{day}/run1.csv").write_text(f"{day}")
+    found = analyse(tmp_path / "logs", tmp_path / "s.json", AnalysisSettings(pattern="**/*.csv"))
+    assert [one.file for one in found.entries] == [f"day{day}/run1.csv" for day in range(1, 4)]
+    assert [one.frequencies[0] for one in found.entries] == [1, 2, 3]
+    (tmp_path / "table.csv").write_text("log,T\nday2/run1.csv,7\n")
+    known = with_conditions(found, read_conditions(tmp_path / "table.csv"))
+    assert [dict(one.conditions) for one in known.entries] == [{}, {"T": 7.0}, {}]
+
+
+def end_itself(path, _):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_is_ended_from_outside(tmp_path, monkeypatch):
+    """As by the system for want of memory."""
+    monkeypatch.setattr("tuning.monitoring.history.entry_of", end_itself)
+    for i in range(2):
+        (tmp_path / f"{i}.csv").write_text("")
+    with pytest.raises(ChildProcessError, match="ended from outside, .* with fewer processes"):
+        analyse(tmp_path, tmp_path / "modes.json", processes=2)
 
 
 def order_of(starts: dict[str, str], folder, monkeypatch) -> list[str]:
