@@ -141,23 +141,6 @@ def test_frozen_poles_with_a_gain_that_varies_compile_nothing():
         )
 
 
-def test_pole_of_published_loop_with_filter():
-    """`frozen_eig` of the reference numbers: 0.509 kg stationary at midspan, filter of 10 Hz."""
-    beam = jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=5)
-    patch = jb.Patch(start=0.2575, end=0.3425, moment_per_volt=0.000265358032154821)
-    filter = jb.Filter(cutoff=10.0, order=10, realisation="analogue")
-    case = jb.Case(
-        beam, actuators=[patch], sensors=[jb.Sensor(0.3, filter=filter)],
-        loads=[jb.MovingMass(mass=0.509, times=[0.0, 1.0], positions=[0.3, 0.3])],
-        controller=jb.Feedback([2000.0 * 200.0]),
-    )  # fmt: skip
-    loop = linearised_loop(case, 0.5)
-    rightmost = loop.poles()[0]
-    assert rightmost.real == pytest.approx(0.6891684603605122, rel=1e-6)
-    assert abs(rightmost.imag) == pytest.approx(62.83126204745206, rel=1e-8)
-    assert loop.growth_rate() == pytest.approx(rightmost.real, rel=1e-9)
-
-
 @pytest.mark.parametrize("period", [None, 0.01])
 def test_derivatives_of_the_growth_rate_by_gains(period):
     """Against differences of the eigenvalues by NumPy."""
@@ -296,18 +279,6 @@ def test_growth_against_scipy():
     root = np.linalg.cholesky(scipy.linalg.block_diag(stiffness, half * np.eye(2))).T
     part = root @ crossing_transition(SPEED, end)[:4, :4] @ np.linalg.inv(root)
     assert found.factor[1] == pytest.approx(np.linalg.norm(part, ord=2), rel=1e-4)
-
-
-def test_floquet_multipliers_against_scipy():
-    case = shaker_case(jb.StateFeedback(gain=GAIN, coordinates="sine"), modes=2)
-    found = stream(jb.replace(case, {"loads.0.speed": 20.0}), 0.04)
-    unloaded_transition = scipy.linalg.expm(0.01 * closed_matrix(0.0, 0.0, 0.0))
-    expected = np.linalg.eigvals(unloaded_transition @ crossing_transition(20.0, 0.03))
-    order = np.argsort(-np.abs(expected))[:3]
-    np.testing.assert_allclose(
-        np.sort(np.abs(found.multipliers))[::-1][:3], np.abs(expected)[order], rtol=1e-4
-    )
-    assert found.stable and found.period == 0.04
 
 
 def test_limit_of_a_gain_is_its_gain_margin():

@@ -245,20 +245,6 @@ def test_finite_elements_with_patch_coil_and_stationary_masses():
     assert np.abs(corrected - np.array(expected)[:, 0]).max() < errors[:, 0].max() / 5
 
 
-def test_transmitted_force_at_zero_frequency_is_the_static_one():
-    pair = ("actuators.1", "actuators.1.transmitted_force")
-    at_rest = float(frequency_response(GENERAL, [0.0], [pair]).of(*pair)[0].real)
-    lift = float(receptance(GENERAL, 0.0, 0.7, 0.7)[0].real)
-    assert_allclose(at_rest, 2.0 * (1 - 300.0 * lift), rtol=1e-9)
-
-
-def test_reciprocity():
-    x = np.array([0.1, 0.42, 1.0, 1.3])
-    found = receptance(GENERAL, F, x, x, [(0.5, 0.2)])
-    size = np.abs(found).max(axis=(1, 2), keepdims=True)
-    assert_allclose(found / size, found.swapaxes(1, 2) / size, atol=1e-10)
-
-
 def test_responses_differentiate_inside_jit():
     names = ("beam.flexural_rigidity", "actuators.0.resistance", "sensors.0.position")
     layout, pairs = mesh_layout(RIG_A), common_pairs(RIG_A)

@@ -264,23 +264,6 @@ def test_moments_with_few_modes():
     assert few == pytest.approx(exact, abs=2e-3 * np.abs(exact).max())
 
 
-def test_sweep_is_that_of_single_runs():
-    case = jb.Case(
-        dataclasses.replace(BRIDGE, modes=2),
-        sensors=[jb.Sensor(12.5)],
-        loads=[jb.MovingForce(force=2e5, speed=40.0)],
-        absorbers=[jb.Absorber(9.0, mass=2e3, frequency=3.4, damping_ratio=0.1)],
-        run=jb.Run(0.8, sample_rate=50.0),
-    )
-    axes = {"absorbers.0.frequency": [3.0, 3.6], "absorbers.0.position": [8.0, 12.0]}
-    peaks = jb.sweep(case, axes, progress=False).peak_deflection.values[..., 0]
-    for i, frequency in enumerate(axes["absorbers.0.frequency"]):
-        for j, position in enumerate(axes["absorbers.0.position"]):
-            numbers = {"absorbers.0.frequency": frequency, "absorbers.0.position": position}
-            one = jb.simulate(jb.replace(case, numbers)).peak_deflection[0]
-            assert peaks[i, j] == pytest.approx(float(one), rel=1e-6)
-
-
 def test_largest_stroke_is_stated(tmp_path):
     absorber = jb.Absorber(12.5, mass=3e3, frequency=3.4, damping_ratio=0.1, max_stroke=1e-5)
     case = jb.Case(

@@ -206,26 +206,6 @@ def test_speed_and_mass_from_deflections_without_gates():
     assert_allclose(mass[at:], 0.3, rtol=0.01)
 
 
-def test_load_is_identified_without_gates_in_the_loop():
-    identification = jb.LoadIdentification(threshold=2e-5, until=0.4)
-    gentle = WEIGHTS | {"command_weight": [1e-2], "period": 2e-3}
-    law = LQR(
-        **gentle,
-        masses=[0.2, 0.6],
-        speeds=[0.5, 1.0],
-        load_identification=identification,
-        horizon="crossing",
-        schedule="load",
-    )
-    record = jb.simulate(beam_case(law, 0.5, 0.8, duration=1.1, sample_rate=500.0))
-    before = np.asarray(record.times) < 0.2 + 0.3 * 0.75
-    assert np.all(record.command[before] == 0)
-    assert np.max(np.abs(record.command)) > 0.01
-    found = identified_load(record, identification)
-    assert abs(found.speed_error) < 0.1
-    assert abs(found.mass_error) < 0.1
-
-
 def test_position_of_a_load_at_rest():
     """Anywhere: near the pins deflections are rounding, whose ratio may fit any position."""
     case = beam_case()
