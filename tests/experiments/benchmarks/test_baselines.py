@@ -5,7 +5,6 @@ import time
 import jax
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from experiments.benchmarks import cases
 from experiments.benchmarks.common import Timing, time_call
@@ -20,6 +19,7 @@ from experiments.benchmarks.rivals.baselines import (
     scipy_peaks,
     scipy_time,
 )
+from tests.oracles import modal_equations
 from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
 from tests.oracles.crossing import Load
 from tests.oracles.modal_equations import Span
@@ -46,39 +46,14 @@ def test_diffrax_agrees_to_one_in_a_million(reference, shared_steps):
 
 
 def test_reference_agrees_with_the_coupled_equations_sampled_finely():
-    """The full mass matrix, Gaussian elimination, and no closed form after the exit."""
-    mass, speed, length, modes = 0.7, 6.0, 0.6, 3
-    order = np.arange(1, modes + 1)
-    wavenumber = order * np.pi / length
-    stiffness = 11.68 * wavenumber**4
-    damping = 2 * 0.03 * np.sqrt(stiffness * 0.535)
-
-    def rate(t, state):
-        """Modal amplitudes of sines, modal mass 0.535 L / 2 each."""
-        q, velocity = np.split(state, 2)
-        inertia = 0.535 * length / 2 * np.eye(modes)
-        force = -length / 2 * (stiffness * q + damping * velocity)
-        if t < length / speed:
-            sine = np.sin(wavenumber * speed * t)
-            cosine = np.cos(wavenumber * speed * t)
-            inertia = inertia + mass * np.outer(sine, sine)
-            convected = 2 * speed * wavenumber * cosine @ velocity
-            convected -= speed**2 * (wavenumber**2 * sine) @ q
-            force = force - mass * (9.81 + convected) * sine
-        return np.concatenate([velocity, np.linalg.solve(inertia, force)])
-
-    state, largest = np.zeros(2 * modes), 0.0
-    for start, end in [(0.0, length / speed), (length / speed, length / speed + 0.5)]:
-        inside = np.nextafter(end, 0) if start == 0 else end
-        samples = np.linspace(start, inside, 200001)  # misses 2e-8 of a peak
-        run = solve_ivp(
-            rate, (start, inside), state, "DOP853", samples, rtol=1e-10, atol=1e-15, max_step=1e-2
-        )
-        sensors = np.sin(np.outer([0.15, 0.3, 0.45], wavenumber))
-        largest = np.maximum(largest, np.abs(sensors @ run.y[:modes]).max(axis=1))
-        state = run.y[:, -1]
-    expected = reference_peaks(PinnedBeam(modes), [mass], [speed])[0, 0]
-    np.testing.assert_allclose(largest, expected, rtol=1e-7)
+    """The full mass matrix, and no closed form after the exit."""
+    beam, times = PinnedBeam(3), np.linspace(0.0, 0.6, 20_001)
+    span = Span(beam.length, beam.flexural_rigidity, beam.mass_per_length, 3, beam.damping_ratio)
+    run = modal_equations.respond(span, [Load(0.7, 6.0)], beam.sensors, times)
+    rates = run.modal_rate @ span.shapes(np.array(beam.sensors)).T
+    expected = reference_peaks(beam, [0.7], [6.0])[0, 0]
+    peaks = hermite_peaks(np.diff(times), run.deflection, rates)
+    np.testing.assert_allclose(peaks, expected, rtol=1e-7)
 
 
 def test_cubic_peaks_are_exact_for_a_cubic_and_need_no_sample_at_the_peak():
