@@ -173,18 +173,6 @@ def test_simulate_prints_and_writes_the_same(run, folder, monkeypatch):
     record = jb.simulate(load_case(folder / "case.toml"))
     found = run("simulate case.toml --json")
     np.testing.assert_array_equal(found["peak_deflection"], record.peak_deflection)
-    assert set(found) == {
-        "sensors",
-        "peak_deflection",
-        "lowest_contact_force",
-        "largest_contact_force",
-        "wheel_unloading",
-        "contact_lost_time",
-        "error_estimate",
-        "steps",
-        "verdict",
-        "plausibility",
-    }
     factors = [sensor["dynamic_amplification"] for sensor in found["sensors"]]
     np.testing.assert_allclose(
         factors, jb.sections.amplification(record.case, [0.3, 0.15]), rtol=1e-6

@@ -67,15 +67,6 @@ def values(record):
     return np.column_stack([record.times, record.sensor_values, record.contact_force])
 
 
-def test_csv(record, values, tmp_path):
-    record.save(tmp_path / "run.csv")
-    with (tmp_path / "run.csv").open(encoding="utf-8", newline="") as file:
-        heads, *rows = csv.reader(file)
-    assert heads == HEADS == list(record.columns)
-    np.testing.assert_array_equal(np.array(rows, float), values)
-    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
-
-
 def test_matlab(record, values, tmp_path):
     import scipy.io
 

@@ -652,44 +652,8 @@ def test_a_file_without_headings_is_read_with_named_columns(tmp_path):
 
 def test_units_are_given_with_the_names_of_columns(tmp_path):
     path = tmp_path / "run.csv"
-    path.write_text("t,a,b\n0,1,2\n1,3,4\n")
     path.write_text("t [s],a,b\n0,1,2\n1,3,4\n")
     assert read_log(path, columns="b [mm]").values[:, 0].tolist() == [2e-3, 4e-3]
-
-
-def write_uff(path, unit="mm", kind=1):
-    pyuff = pytest.importorskip("pyuff")
-    for node, values in ((1, D1), (2, D2)):
-        function = pyuff.prepare_58(
-            return_full_dict=True, binary=0, id1="run", id2="", id3="", id4="", id5="",
-            func_type=kind, ver_num=1, load_case_id=0, rsp_ent_name="", rsp_node=node, rsp_dir=3,
-            ref_ent_name="", ref_node=0, ref_dir=0, ord_data_type=4, num_pts=values.size,
-            abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=TIMES[1], z_axis_value=0.0,
-            ordinate_spec_data_type=8, ordinate_axis_units_lab=unit, data=values, x=TIMES,
-            orddenom_spec_data_type=0,
-        )  # fmt: skip
-        function = {key: value for key, value in function.items() if value is not None}
-        pyuff.UFF(str(path)).write_sets(function, mode="add" if node > 1 else "overwrite")
-
-
-@pytest.mark.parametrize("unit", ["mm", "NONE"])
-def test_universal_file(tmp_path, unit):
-    write_uff(tmp_path / "run.uff", unit)
-    log = read_log(tmp_path / "run.uff")
-    scale = 1e-3 if unit == "mm" else 1.0
-    assert log.names == ("1z", "2z") and log.quantities == ("deflection",) * 2
-    np.testing.assert_allclose(log.times, TIMES, atol=1e-6)
-    np.testing.assert_allclose(log.values, scale * np.column_stack([D1, D2]), atol=1e-6 * scale)
-
-
-def test_universal_file_that_cannot_be_read(tmp_path):
-    path = tmp_path / "run.uff"
-    write_uff(path, kind=4)
-    with pytest.raises(ValueError, match="run.uff: the universal file has 2 functions, none of"):
-        read_log(path)
-    path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(ValueError, match="^[^\n]*run.uff: the file is damaged|no functions"):
-        read_log(path)
 
 
 def test_workbook_that_is_damaged(tmp_path):

@@ -123,19 +123,15 @@ AMBIENT = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize("seed", [1412, 1508, 1913, pytest.param(2103, marks=AMBIENT)])
+@pytest.mark.parametrize(
+    "seed", [1412, 1498, 1508, 1913, 2605, 2643, pytest.param(2103, marks=AMBIENT)]
+)
 def test_what_falls_before_a_load_has_left_is_no_decay(seed):
-    """Of smooth loads; vibrations grow in two of these parts, several are made of one in two."""
-    planted = sampled(random_structure(seed), "crossing", seed, 60.0)
-    fit = identify_modes(log_of(planted))
-    one = compare(fit, planted)
-    assert not one.missed and not one.false_modes
-    assert [start > 29.5 for start, _ in fit.windows] == [True]
+    """Of smooth loads; vibrations grow in two of these parts, several are made of one in two.
 
-
-@pytest.mark.parametrize("seed", [1498, 2605, 2643])
-def test_loads_whose_vibration_falls_before_they_leave(seed):
-    """It falls as a decay would but for forces: 2605 rises as the load leaves, 2643 goes on."""
+    Vibration of 1498, 2605 and 2643 falls as a decay would but for forces: 2605 rises as the load
+    leaves, 2643 goes on.
+    """
     planted = sampled(random_structure(seed), "crossing", seed, 60.0)
     fit = identify_modes(log_of(planted))
     one = compare(fit, planted)
