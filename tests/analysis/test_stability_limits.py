@@ -36,6 +36,7 @@ from tests.analysis.test_stability import (
     state_matrices,
 )
 from tests.loop_as_oracle import span_of
+from tests.oracles.held_period import over_period
 
 STATES = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
 
@@ -158,6 +159,24 @@ def test_stream_is_stable_with_unstable_frozen_poles():
     limit = scipy.optimize.brentq(lambda v: largest_frozen(row, v, MASS), 6.0, 12.0, rtol=1e-7)
     found = load_stability_limits(dataclasses.replace(case, loads=(slow,)), factor=3.0, points=3)
     assert found.speed == pytest.approx(limit, rel=1e-5)
+
+
+def test_stream_of_a_sampled_loop():
+    """Commands held for a period, by scipy: thirty periods with the load, ten without it."""
+    row, speed, period = np.array([[300.0, -800.0, 12.0, 0.5, 0.0]]), 20.0, 1e-3
+    case = state_feedback_case(row, speed, MASS)
+    law = dataclasses.replace(case.controller, period=np.asarray(period))
+    found = stream(dataclasses.replace(case, controller=law), 0.04)
+
+    def matrices_at(t):
+        return state_matrices(speed * t, speed, MASS * (t < LENGTH / speed), 4.6, modes=2)
+
+    transition = np.eye(5)
+    for start in period * np.arange(40):
+        A, B = over_period(matrices_at, start, start + period, [LENGTH / speed])
+        transition = (A - B @ row) @ transition
+    largest = np.sort(np.abs(np.linalg.eigvals(transition)))[-3:]
+    np.testing.assert_allclose(np.sort(np.abs(found.multipliers))[-3:], largest, rtol=2e-4)
 
 
 def test_crossing_amplifies_with_stable_frozen_poles(monkeypatch):
