@@ -57,17 +57,26 @@ def record_files(run: str, names: dict) -> None:
     codes = set()
 
     def profile(frame, event, argument):
-        if event == "call":
+        if event == "call" and frame.f_code not in codes and not _importing(frame):
             codes.add(frame.f_code)
 
     threading.setprofile(profile)
     sys.setprofile(profile)
     exec(run, names)
     sys.setprofile(None)
-    called = {code.co_filename for code in codes.copy() if code.co_name != "<module>"}
+    called = {code.co_filename for code in codes.copy()}
     inside = {Path(name) for name in called if Path(name).is_relative_to(ROOT)}
     parts = sorted(path.relative_to(ROOT) for path in inside)
     print("\n".join(str(path) for path in parts if path.parts[0] in PACKAGES))
+
+
+def _importing(frame) -> bool:
+    """Whether a frame is that of a call by the import of a module."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def counts_table() -> str:

@@ -98,7 +98,8 @@ def load(name: str) -> BenchmarkProblem:
     """
     table: Any = _tables().get(name)
     if table is None:
-        raise ValueError(f"there is no problem {name!r} in the benchmark; it has {_listed()}")
+        listed = ", ".join(names())
+        raise ValueError(f"there is no problem {name!r} in the benchmark; it has {listed}")
     with resources.as_file(resources.files("jaxbeam.benchmark") / f"problems/{name}.toml") as path:
         case = load_case(path)
     return BenchmarkProblem(
@@ -116,7 +117,3 @@ def load(name: str) -> BenchmarkProblem:
 def _tables() -> dict[str, Any]:
     text = (resources.files("jaxbeam.benchmark") / "problems.toml").read_text("utf-8")
     return tomllib.loads(text)
-
-
-def _listed() -> str:
-    return ", ".join(names())

@@ -140,9 +140,3 @@ class Absorber(ReprWithUnits):
     def force_histories(self) -> dict[int, ForceHistory]:
         """Forces over time by index of the wheel: no entries."""
         return {}
-
-    def dynamic_stiffness(self, s) -> Array:
-        """F / y at Laplace variables s (1/s), complex, in N/m; see the module."""
-        spring = self.spring + s * self.damper + s**2 * self.inertance
-        inertia = s**2 * (self.mass + self.ground_inertance)
-        return spring * inertia / (spring + inertia)

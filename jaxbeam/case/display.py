@@ -90,11 +90,8 @@ def _explanation(part_class: type, args: tuple, arguments: dict) -> str | None:
     ]
     if not missing:
         return None
-    return f"{part_class.__name__} lacks {'; '.join(missing)}: give {_them(missing)}"
-
-
-def _them(missing: list[str]) -> str:
-    return "it" if len(missing) == 1 else "them"
+    them = "it" if len(missing) == 1 else "them"
+    return f"{part_class.__name__} lacks {'; '.join(missing)}: give {them}"
 
 
 def _is_required(field: dataclasses.Field) -> bool:

@@ -303,8 +303,7 @@ class ScheduledGainLaw(AbstractStateLaw):
         """Weight of each design of a grid at a value."""
         if self.nearest:
             return xp.asarray(np.arange(grid.shape[0]) == xp.argmin(xp.abs(grid - value)), float)
-        unit_vectors = np.eye(grid.shape[0])
-        return vmap(lambda weights: xp.interp(value, grid, weights))(unit_vectors)
+        return _hat_weights(grid, value)
 
 
 class ReadLoads(NamedTuple):

@@ -482,20 +482,6 @@ def parameters(model: PolynomialModel) -> Float[Array, " parameter"]:
     return xp.concatenate([model.denominator, model.numerators.reshape(-1)])
 
 
-def lift_and_delay(
-    model: PolynomialModel,
-) -> tuple[Float[Array, "output actuator"], Float[Array, "output actuator"]]:
-    """Static response to each command, and the delay (periods) of slow ones behind it.
-
-    With A(1) = 1 + sum of a and B(1) = sum of B, lift B(1) / A(1), and the group delay at zero
-    frequency, sum of i B_i / B(1) - sum of i a_i / A(1).
-    """
-    powers = xp.arange(1.0, model.denominator.shape[0] + 1)
-    A, B = 1 + xp.sum(model.denominator), xp.sum(model.numerators, axis=0)
-    of_numerators = xp.einsum("p,poa->oa", powers, model.numerators) / B
-    return B / A, of_numerators - powers @ model.denominator / A
-
-
 @functools.cache
 def probe_signs() -> Float[np.ndarray, " sample"]:
     """Signs of the probing sequence: a maximum-length one, whose spectrum is white."""

@@ -32,25 +32,14 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 OF_TWIST = TWIST, TWIST_RATE
 
 
-def residual_actuator_gain(
-    case: Case, x, derivative: int = 0, layout: Layout | None = None
-) -> Float[Array, "actuator *position"]:
-    """Residual of the modes in `static_deflection_per_command` at x (m), in m/V or m/N.
-
-    `derivative` (up to 3) gives that x-derivative instead. Suspensions act on both, the exact beam
-    and the modes. Raises ValueError as `static_deflection_per_command` does.
-    """
-    per_force = residual_port_flexibility(case, x, derivative, layout)
-    gains = xp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
-    return gains.reshape(-1, *(1,) * (per_force.ndim - 1)) * per_force
-
-
 def residual_port_flexibility(
     case: Case, x, derivative: int = 0, layout: Layout | None = None
 ) -> Float[Array, "actuator *position"]:
     """Residual of the modes in the static deflection per force of each actuator on the beam.
 
-    In m/N for a force, 1/N for a couple; otherwise as `residual_actuator_gain`.
+    At x (m), in m/N for a force, 1/N for a couple; `derivative` (up to 3) gives that x-derivative
+    instead. Suspensions act on both, the exact beam and the modes. Raises ValueError as
+    `static_deflection_per_command` does.
     """
     layout = mesh_layout(case) if layout is None else layout
     exact = static_deflection_per_port_force(case, x, derivative, layout)

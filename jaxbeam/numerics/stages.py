@@ -578,7 +578,9 @@ def _double_cost(transition, input_responses, cost, count):
     """Cost of two equal intervals together, for inputs with coefficients over both."""
     states = transition.shape[0]
     first = 0.5 ** np.arange(NODE_COUNT)
-    first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
+    # Columns (state, power and input).
+    first_half_inputs = xp.moveaxis(input_responses * first[:, None, None], 0, 1)
+    first_half_inputs = first_half_inputs.reshape(states, -1)
     scale = np.append(np.ones(states), np.repeat(first, count))
     # (coefficient over the second, coefficient over both)
     second_half_weights = shift_weights(NODE_COUNT).T * first
@@ -603,8 +605,3 @@ def _double_cost(transition, input_responses, cost, count):
     return cost * scale * scale[:, None] + xp.concatenate(
         [top, xp.concatenate([new_cross_cost.T, new_input_cost], axis=1)]
     )
-
-
-def _flatten_columns(input_responses):
-    """Responses (power, state, input) as columns (state, power and input)."""
-    return xp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)

@@ -59,6 +59,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     dataset = _with_extremes(dataset.assign(empty), case)
     if "step_errors" not in dataset.variables:  # of release 0.1.0
         dataset = dataset.assign(step_errors=("sensor", np.full(len(case.sensors), np.nan)))
+    sampled = case.controller is not None and case.controller.period is not None
     mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
     required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
     missing = [name for name in required if name not in dataset.variables]
@@ -84,7 +85,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         times=xp.asarray(dataset["time"].values),
         error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),
-        controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
+        controller_readings=xp.asarray(dataset["measured"].values) if sampled else None,
         acting_command=None if acting is None else xp.asarray(acting.values),
         result=None if result is None else xp.asarray(int(result)),
         flights=_flights(dataset, case),
@@ -122,10 +123,6 @@ def _with_extremes(dataset: "xarray.Dataset", case: Case) -> "xarray.Dataset":
         found[name] = ("sensor", np.where(measured, extreme, np.nan))
         found[f"{name}_time"] = ("sensor", np.where(measured, times[index], np.nan))
     return dataset.assign(found)
-
-
-def _is_sampled(case: Case) -> bool:
-    return case.controller is not None and case.controller.period is not None
 
 
 def read_record(path: str | os.PathLike) -> Record:

@@ -104,7 +104,8 @@ class StrokeWarning(UserWarning):
 def warn_of_strokes(case: Case, dataset: "xarray.Dataset") -> None:
     """Warn of absorbers of a case whose strokes exceed `max_stroke` in runs of its sweep."""
     for i, absorber in enumerate(case.absorbers):
-        name = next((n for n in _max_stroke_names(i) if n in dataset.coords), None)
+        swept = f"absorbers.{i}.max_stroke", "absorbers.*.max_stroke"
+        name = next((name for name in swept if name in dataset.coords), None)
         if name is None and absorber.max_stroke is None:
             continue
         strokes = dataset["peak_stroke"].isel(absorber=i)
@@ -117,11 +118,6 @@ def warn_of_strokes(case: Case, dataset: "xarray.Dataset") -> None:
                 StrokeWarning,
                 stacklevel=3,
             )
-
-
-def _max_stroke_names(i: int) -> tuple[str, str]:
-    """Addresses at which the largest stroke of an absorber may be swept."""
-    return f"absorbers.{i}.max_stroke", "absorbers.*.max_stroke"
 
 
 class TruncationWarning(UserWarning):

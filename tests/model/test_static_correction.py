@@ -22,8 +22,8 @@ from jaxbeam.model.static_correction import (
     Motion,
     bending_moment,
     corrected_history,
-    residual_actuator_gain,
     residual_flexibility,
+    residual_port_flexibility,
     shear_force,
 )
 from tests.differences import central
@@ -110,7 +110,8 @@ def test_modes_plus_residual_are_exact(model, derivative):
     states = -np.linalg.solve(matrix, np.asarray(model.command_matrix))
     modal = (shapes @ states[: 2 * modes : 2]).T
     exact = np.asarray(static_deflection_per_command(GENERAL, X, derivative))
-    found = modal + residual_actuator_gain(GENERAL, X, derivative)
+    gains = np.array([one.attachment().static_gain for one in GENERAL.actuators])[:, None]
+    found = modal + gains * residual_port_flexibility(GENERAL, X, derivative)
     assert_allclose(found, exact, rtol=0, atol=1e-10 * np.abs(modal).max())
     load_input = np.zeros((len(matrix), y.size))
     load_input[1 : 2 * modes : 2] = -np.asarray(model.shapes(y, (0,))[0]).T

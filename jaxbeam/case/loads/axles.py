@@ -17,8 +17,13 @@ from jaxbeam.case.fields import (
     number,
     suggestion,
 )
-from jaxbeam.case.loads.base import AbstractRowLoad, AbstractVehicleLoad, length_error, plain_wheels
-from jaxbeam.case.trajectory import StandingTrajectory
+from jaxbeam.case.loads.base import (
+    AbstractRowLoad,
+    AbstractStandingLoad,
+    AbstractVehicleLoad,
+    length_error,
+    plain_wheels,
+)
 from jaxbeam.library.published import LEFT_OUT, Train, line_loads, trains
 from jaxbeam.runtime.arrays import Number, xp
 
@@ -135,7 +140,7 @@ class Axles(AbstractRowLoad):
         return plain_wheels(xp.asarray(forces), xp.asarray(masses), self.offsets)
 
 
-class LineLoad(AbstractVehicleLoad):
+class LineLoad(AbstractStandingLoad, AbstractVehicleLoad):
     """Forces per length in one or more parts, one behind the other, as many point forces each.
 
     A `model` of the library, LM71, SW/0, SW/2 or "unloaded-train", or own lists. Each part is
@@ -177,12 +182,7 @@ class LineLoad(AbstractVehicleLoad):
 
     def validate(self, address):
         error = self._model_error(address) if self.model else self._list_error(address)
-        if error is not None or self.position is None:
-            return error or super().validate(address)
-        for name in ("speed", "times", "start_position"):
-            if getattr(self, name) is not None:
-                return f"{address} has both position and {name}; leave one out"
-        return None
+        return error or super().validate(address)
 
     def _model_error(self, address: str) -> str | None:
         if self.model not in line_loads():
@@ -205,11 +205,6 @@ class LineLoad(AbstractVehicleLoad):
                     return f"{address}.lengths must be a list as {name} is, one for each part"
             return None
         return length_error(address, self, "lengths", ("force_per_length", "gaps"))
-
-    def trajectory(self, length):
-        if self.position is None:
-            return super().trajectory(length)
-        return StandingTrajectory(self.position, self.entry_time, length)
 
     def vehicle(self, gravity):
         axle_offsets, axle_forces = np.zeros(0), np.zeros(0)

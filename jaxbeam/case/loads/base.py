@@ -34,6 +34,7 @@ from jaxbeam.case.fields import (
 from jaxbeam.case.trajectory import (
     AbstractPiecewiseTrajectory,
     BrakingTrajectory,
+    StandingTrajectory,
     TabulatedTrajectory,
 )
 from jaxbeam.runtime.arrays import Array, Module, Number, cholesky, solve, xp
@@ -251,6 +252,25 @@ class AbstractVehicleLoad(AbstractLoad):
     eccentricity: Float[Number, ""] | None = number(
         "m", "distance left of the axis of the beam, looking right", default=None, kw_only=True
     )
+
+
+class AbstractStandingLoad(AbstractLoad):
+    """Load that travels as others do, or stays at a `position` (m) from the entry time on."""
+
+    position: eqx.AbstractVar[Float[Array, ""] | None]
+
+    def trajectory(self, length):
+        if self.position is None:
+            return super().trajectory(length)
+        return StandingTrajectory(self.position, self.entry_time, length)
+
+    def validate(self, address):
+        if self.position is None:
+            return super().validate(address)
+        for name in ("speed", "times", "start_position"):
+            if getattr(self, name) is not None:
+                return f"{address} has both position and {name}; leave one out"
+        return None
 
 
 def wheel_distances(load: Any, vehicle: VehicleModel) -> Float[Array, " wheel"]:

@@ -8,12 +8,12 @@ from jaxtyping import Float
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, number, validate_exactly_one
 from jaxbeam.case.loads.base import (
     AbstractLoad,
+    AbstractStandingLoad,
     AbstractVehicleLoad,
     ForceHistory,
     length_error,
     plain_wheels,
 )
-from jaxbeam.case.trajectory import StandingTrajectory
 from jaxbeam.runtime.arrays import Number, xp
 
 
@@ -63,7 +63,7 @@ class MovingForce(AbstractLoad):
         return plain_wheels(force, xp.zeros(()))
 
 
-class VaryingForce(AbstractVehicleLoad):
+class VaryingForce(AbstractStandingLoad, AbstractVehicleLoad):
     """Force F(t) = `force` + sum of A sin(2 pi f t + phase) + a table, positive downwards.
 
     t is in s from the start of the run. The table has `forces` at `force_times`, straight lines
@@ -110,17 +110,7 @@ class VaryingForce(AbstractVehicleLoad):
             return f"{address}.{absent} is missing; a table has both force_times and forces"
         if self.force_times is not None:
             error = length_error(address, self, "force_times", ("forces",))
-        if error is not None or self.position is None:
-            return error or super().validate(address)
-        for name in ("speed", "times", "start_position"):
-            if getattr(self, name) is not None:
-                return f"{address} has both position and {name}; leave one out"
-        return None
-
-    def trajectory(self, length):
-        if self.position is None:
-            return super().trajectory(length)
-        return StandingTrajectory(self.position, self.entry_time, length)
+        return error or super().validate(address)
 
     def vehicle(self, gravity):
         return plain_wheels(self.force, xp.zeros(()))

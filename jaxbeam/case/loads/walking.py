@@ -36,8 +36,13 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
-from jaxbeam.case.loads.base import AbstractVehicleLoad, ForceHistory, length_error, plain_wheels
-from jaxbeam.case.trajectory import StandingTrajectory
+from jaxbeam.case.loads.base import (
+    AbstractStandingLoad,
+    AbstractVehicleLoad,
+    ForceHistory,
+    length_error,
+    plain_wheels,
+)
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 WEIGHT = 700.0  # N, of the reference pedestrian of prEN 1991-2, annex X, as coded in xcfem/xc
@@ -139,7 +144,7 @@ class AbstractWalkingLoad(AbstractVehicleLoad):
         )
 
 
-class Pedestrian(AbstractWalkingLoad):
+class Pedestrian(AbstractStandingLoad, AbstractWalkingLoad):
     """A person of a weight whose steps are harmonics of the pace; see `footfalls`.
 
     One step is at `step_time`, by default the `entry_time`. With a `position` the person stays
@@ -165,17 +170,7 @@ class Pedestrian(AbstractWalkingLoad):
 
     def validate(self, address):
         error = self.step_error(address)
-        if error is not None or self.position is None:
-            return error or super().validate(address)
-        for name in ("speed", "times", "start_position"):
-            if getattr(self, name) is not None:
-                return f"{address} has both position and {name}; leave one out"
-        return None
-
-    def trajectory(self, length):
-        if self.position is None:
-            return super().trajectory(length)
-        return StandingTrajectory(self.position, self.entry_time, length)
+        return error or super().validate(address)
 
     def vehicle(self, gravity):
         return plain_wheels(self.weight, xp.zeros(()))
@@ -213,15 +208,13 @@ class Crowd(AbstractWalkingLoad):
         deviation = self.pace_deviation
         if error is None and is_concrete(self.pace) and is_concrete(deviation):
             slowest = concrete(self.pace) - 3 * concrete(deviation)
-            if slowest <= (LEAST_WALKING_PACE if self._has_walking_factors() else 0):
+            walking = self.factors is None and self.activity == "walking"
+            if slowest <= (LEAST_WALKING_PACE if walking else 0):
                 return (
                     f"{address}.pace_deviation is too large: the slowest pace, three deviations"
                     f" below the mean, would be {slowest:g} Hz; give a smaller one"
                 )
         return error or super().validate(address)
-
-    def _has_walking_factors(self) -> bool:
-        return self.factors is None and self.activity == "walking"
 
     def _draws(self):
         """Random places and step times of all people (0 to 1), and deviates of their paces."""

@@ -185,7 +185,7 @@ def tune(
         )
         tuned = (result.tuned,)
     else:
-        checkpoint = _checkpoint(output)
+        checkpoint = None if output is None else output.with_suffix(".search.npz")
         if checkpoint and options.overwrite and not resume:
             checkpoint.unlink(missing_ok=True)
         with kept_in(checkpoint):
@@ -211,10 +211,6 @@ def _check_combination(kinds: dict[str, bool], searches: bool, resume: bool) -> 
         (several and searches) or (bool(given) and resume),
         f"--batch, --starts and --resume are for a single search, not for {''.join(given)}",
     )
-
-
-def _checkpoint(output: Path | None) -> Path | None:
-    return None if output is None else output.with_suffix(".search.npz")
 
 
 def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptions) -> None:

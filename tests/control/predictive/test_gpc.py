@@ -13,7 +13,6 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.gpc import (
     PolynomialModel,
-    lift_and_delay,
     polynomial_model,
     predicted_outputs,
     predictive_gains,
@@ -194,11 +193,6 @@ def test_true_plant_is_found_with_its_delay():
     model = law.model(probed(law, commands, readings)[-1])
     assert_allclose(model.denominator[:2], a, rtol=1e-3)
     assert_allclose(model.numerators[:, 0, 0], b, atol=1e-3 * np.max(b))
-    lift, delay = lift_and_delay(model)
-    assert_allclose(lift, np.sum(b) / (1 + np.sum(a)), rtol=2e-3)
-    # Behind the delay: half a period of holding, and the lag 2 zeta / omega of the mode.
-    omega = np.sqrt(8.0 / 0.5) * (np.pi / 0.6) ** 2
-    assert_allclose(delay, 2 + 0.5 + 0.04 / omega / ADAPTIVE_PERIOD, rtol=1e-2)
 
 
 def test_coefficients_are_those_of_weighted_batch_least_squares():
@@ -250,11 +244,6 @@ def test_covariance_is_capped_without_excitation():
         found = np.asarray(states[k].root @ states[k].root.T)[np.ix_(kept, kept)]
         assert_allclose(found, covariance, rtol=1e-6, atol=1e-9 * np.max(np.abs(start)))
     assert 0 < capped < 99  # both happened
-
-
-def test_lift_and_delay_of_a_pure_delay():
-    model = PolynomialModel(np.zeros(4), np.array([0.0, 0.0, 2.0, 0.0]).reshape(4, 1, 1))
-    assert_allclose(np.ravel(lift_and_delay(model)), [2.0, 3.0])
 
 
 def test_a_delay_that_the_design_lacks():
