@@ -77,14 +77,14 @@ def _no_operation() -> None:
     pass
 
 
-def interleaved_best(functions, *args, rounds=40) -> np.ndarray:
+def interleaved_best(functions, *args) -> np.ndarray:
     """Shortest wall times (s) of several functions, (function,), called in turn.
 
     Disturbances by other processes then affect all functions alike.
     """
     for function in functions:
         jax.block_until_ready(function(*args))
-    times = [[seconds_of(function, *args) for function in functions] for _ in range(rounds)]
+    times = [[seconds_of(function, *args) for function in functions] for _ in range(40)]
     return np.min(times, axis=0)
 
 

@@ -20,12 +20,7 @@ import warnings
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks.common import (
-    measure_in_subprocess,
-    parser,
-    print_row,
-    print_table,
-)
+from experiments.benchmarks.common import measure_in_subprocess, parser, print_row, print_table
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 SIZES = {

@@ -28,13 +28,7 @@ import numpy as np
 import scipy.sparse
 
 import jaxbeam as jb
-from experiments.benchmarks.common import (
-    import_optional,
-    parser,
-    print_row,
-    print_table,
-    time_call,
-)
+from experiments.benchmarks.common import import_optional, parser, print_row, print_table, time_call
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
 from jaxbeam.control.sampled_lqr import SamplingWarning
 from jaxbeam.model.state_space import state_space

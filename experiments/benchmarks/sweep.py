@@ -141,11 +141,8 @@ def derivatives() -> list[tuple[str, float]]:
     def misfit(values):
         return jnp.sum(residual(values) ** 2)
 
-    def directional(values):
-        return jax.jvp(misfit, (values,), (jnp.ones_like(values),))
-
     derivatives_by_name = {
-        "jvp of a misfit": directional,
+        "jvp of a misfit": lambda values: jax.jvp(misfit, (values,), (jnp.ones_like(values),)),
         "Jacobian over six numbers": jax.jacfwd(residual),
         "gradient in reverse mode": jax.grad(misfit),
     }

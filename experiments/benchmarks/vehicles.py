@@ -41,7 +41,7 @@ def quarter_car() -> jb.QuarterCar:
     return jb.QuarterCar(speed=30.0, body_mass=16000.0, axle_mass=AXLE, **springs, **dampers)
 
 
-def peaks(load: str, masses, speeds, tolerance: float = TOLERANCE) -> np.ndarray:
+def peaks(load: str, masses, speeds) -> np.ndarray:
     """Peaks (mass, speed) in m by `jaxbeam.sweep`, for body masses (kg) of quarter cars.
 
     Or for masses of the same weight.
@@ -51,7 +51,7 @@ def peaks(load: str, masses, speeds, tolerance: float = TOLERANCE) -> np.ndarray
     else:
         case, over = bridge(jb.MovingMass(mass=1.0, speed=30.0)), {"loads.0.mass": masses + AXLE}
     over["loads.0.speed"] = speeds
-    return jb.sweep(case, over, tolerance=tolerance, progress=False).peak_deflection.values[..., 0]
+    return jb.sweep(case, over, tolerance=TOLERANCE, progress=False).peak_deflection.values[..., 0]
 
 
 def script_peak(body: float, speed: float, tolerance: float = SCRIPT_TOLERANCE) -> float:

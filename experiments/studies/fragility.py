@@ -14,14 +14,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.studies import tune_feedforward
 from experiments.studies.held_out import HELD_OUT_ENTRY_TIME, with_rigidity
-from experiments.studies.sensor_feedback import SENSORS_ONLY, bench_case, with_cutoff
+from experiments.studies.sensor_feedback import (
+    HAND_DRAWN,
+    SENSORS_ONLY,
+    bench_case,
+    drawn_table,
+    with_cutoff,
+)
 from experiments.studies.tuned_feedforward import (
     BENCH,
-    HAND_DRAWN,
+    FOLDER,
     HAND_SET,
-    drawn_table,
     trapezium,
     with_bench_delay,
 )
@@ -68,7 +72,7 @@ def run(load_rig) -> ExperimentResult:
 
 def laws(case: jb.Case) -> dict[str, jb.Case]:
     """The rig on the bench under each law."""
-    stored = jb.load_case(tune_feedforward.FOLDER / f"{RIG}.toml").controller
+    stored = jb.load_case(FOLDER / f"{RIG}.toml").controller
     sensed = dataclasses.replace(bench_case(RIG, case), run=case.run)
     return {
         HAND_SET: dataclasses.replace(case, controller=with_bench_delay(trapezium(RIG))),

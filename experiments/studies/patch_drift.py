@@ -150,7 +150,7 @@ class RemainingErrors(NamedTuple):
     compensated: float
 
 
-def log_of_patch(seed: int = 1) -> tuning.Log:
+def log_of_patch() -> tuning.Log:
     """Commands and deflections of the patch by itself, quasi-static, sampled at 10 Hz."""
     times = np.arange(0.0, 3.0 * (len(TURNS) - 1) + INTERVAL / 2, INTERVAL)
     commands = np.interp(times, 3.0 * np.arange(len(TURNS)), TURNS)
@@ -158,7 +158,7 @@ def log_of_patch(seed: int = 1) -> tuning.Log:
     patch = dataclasses.replace(rigs.load("B"), loads=(), controller=None)
     gain = float(static_deflection_per_command(patch, 0.3)[0])
     readings = gain * _effective(operator, commands)
-    readings += NOISE * np.random.default_rng(seed).normal(size=times.size)
+    readings += NOISE * np.random.default_rng(1).normal(size=times.size)
     values = np.stack([commands, readings], axis=1)
     return tuning.Log(times, values, ("u", "w"), ("voltage", "deflection"), ("V", "m"))
 

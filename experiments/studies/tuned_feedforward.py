@@ -1,8 +1,8 @@
 """Position-scheduled feedforward on the patch rigs, tuned by gradients; held-out performance.
 
 One table of commands over the position of the load (`jaxbeam.control.feedforward`) serves all
-masses and speeds. It is tuned by `experiments.studies.tune_feedforward` and compared, on held-out
-loads, with the cubic feedback of chapter 6 and the least achievable peak:
+masses and speeds. It is tuned by gradients and compared, on held-out loads, with the cubic feedback
+of chapter 6 and the least achievable peak:
 
 - bench: 20 ms of delay, compensated by an equal lead; then also 10 ms more, which are not
   compensated, or a beam that is 10 % stiffer or softer than the design model;
@@ -15,33 +15,94 @@ Mass and speed are unknown beforehand: the speed is measured by two gates on the
 thesis, the mass not at all. No reading of the beam is fed back, so that noise and filters of its
 sensors have no effect and the loop cannot become unstable.
 
-Laws drawn by hand on the patch rigs, the reference for tuned laws.
+The trapezium drawn by hand, of four numbers on the same gates as the tuned table, is the reference
+for the tuned law: no number of it was fitted to any run.
 
-A trapezium of four numbers on the same gates as the tuned table, and a table over the deflection
-that goes to the limits where the tuning of the sensors-only law starts to be flat. No number of
-them was fitted to any run.
+    python -m experiments.studies.tuned_feedforward B    # or C
+
+tunes the table by gradients and writes controllers/feedforward/B.toml. It starts as a trapezium
+within the limits of the patches; its values follow the gradient of the worst shortfall from the
+least achievable peak. On the bench the same table is read earlier by the delay.
 """
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import numpy as np
 
 import jaxbeam as jb
-from experiments.studies import tune_sensor_feedback
+import tuning
 from experiments.studies.held_out import (
     CUBIC_CUTOFFS,
     CUBIC_FEEDBACK,
     EXTRA_DELAY,
     EXTRA_DELAY_LAW,
+    PERIOD,
     HeldOutStudy,
     draw,
     held_out_loads,
     held_out_study,
+    training_loads,
     with_held_out_duration,
 )
-from experiments.studies.tune_feedforward import COMMAND_LIMITS, FOLDER, initial_law
-from experiments.thesis.cases import with_feedback
+from experiments.thesis.cases import with_feedback, with_modes
 from experiments.thesis.verdicts import Experiment, ExperimentResult
+from jaxbeam import rigs
+
+FOLDER = Path(__file__).parent / "controllers" / "feedforward"
+LEAD = 0.005  # s: half of the sampling period, the mean delay of a held command
+GATES = (-0.2, -0.1)  # m: on the ramp before the beam, as the induction sensors of the thesis
+COMMAND_LIMITS, COMMAND_RESOLUTION = (-2.5, 7.5), 0.01  # V
+SPEEDS = {"B": np.linspace(0.3, 1.0, 12), "C": np.linspace(0.3, 1.0, 8)}  # m/s
+INITIAL_TABLES = {  # V at fractions of the span
+    "B": [([0.0, 0.2, 0.9, 1.0], [0.5, 6.8, 6.8, 0.0])],
+    "C": [
+        ([0.0, 0.1, 0.38, 0.55, 0.75, 1.0], [0.3, 6.8, 6.8, -1.8, -1.8, 0.0]),
+        ([0.0, 0.1, 0.38, 0.55, 0.9, 1.0], [0.0, -1.8, -1.8, 6.8, 6.8, 0.0]),
+    ],
+}
+BREAKPOINTS, STEPS = {"B": 31, "C": 41}, {"B": 250, "C": 140}
+SAMPLE_RATE = {"B": 200.0, "C": 100.0}  # Hz: enough for a smooth peak
+MODES = 3  # of the model in tuning; the studies use those of the rig
+
+
+def initial_law(rig: str) -> jb.Feedforward:
+    """The law that tuning starts from on rig B or C."""
+    shares = np.linspace(0.0, 1.0, BREAKPOINTS[rig])
+    return jb.Feedforward(
+        gates=GATES,
+        shares=shares,
+        values=[np.interp(shares, *table) for table in INITIAL_TABLES[rig]],
+        period=PERIOD,
+        lead=LEAD,
+        resolution=COMMAND_RESOLUTION,
+    )
+
+
+def tune_law(rig: str) -> tuning.TuningResult:
+    """Tune the table and its lead for the worst of all training loads on rig B or C."""
+    case = with_modes(rigs.load(rig), MODES)
+    slowest = float(case.beam.length) / min(SPEEDS[rig])
+    case = dataclasses.replace(
+        case,
+        controller=initial_law(rig),
+        run=jb.Run(duration=slowest + 0.15, sample_rate=SAMPLE_RATE[rig]),
+    )
+    actuators, breakpoints = case.controller.values.shape
+    free = {
+        f"controller.values.{a}.{k}": COMMAND_LIMITS
+        for a in range(actuators)
+        for k in range(breakpoints)
+    }
+    return tuning.tune(
+        case,
+        free | {"controller.lead": (0.0, 0.1)},
+        tuning.LoadCases(training_loads(SPEEDS[rig])),
+        tuning.Objective({"shortfall": 1.0}),
+        steps=STEPS[rig],
+    )
+
 
 LOW, HIGH = COMMAND_LIMITS
 TRAPEZIA = {  # shares of the beam, V: from limit to limit, with ramps drawn by hand
@@ -51,7 +112,7 @@ TRAPEZIA = {  # shares of the beam, V: from limit to limit, with ramps drawn by 
         ([0.0, 0.1, 0.38, 0.55, 0.9, 1.0], [0.0, LOW, LOW, HIGH, HIGH, 0.0]),
     ],
 }
-HAND_SET, HAND_DRAWN = "hand-set trapezium", "hand-drawn, sensors only"
+HAND_SET = "hand-set trapezium"
 
 
 def trapezium(rig: str) -> jb.Feedforward:
@@ -60,15 +121,6 @@ def trapezium(rig: str) -> jb.Feedforward:
     shares = np.unique(np.concatenate([shares for shares, _ in tables]))
     values = np.array([np.interp(shares, *table) for table in tables])
     return dataclasses.replace(initial_law(rig), shares=shares, values=values)
-
-
-def drawn_table(rig: str) -> jb.InternalModel:
-    """The law drawn by hand over the sensors' readings: straight to the limits, then flat."""
-    law = tune_sensor_feedback.initial_law(rig)
-    flat_from, _, above = tune_sensor_feedback.INITIAL_TABLE[rig]  # m, -, V
-    ends = [HIGH, 0.0, LOW if above else 0.0]  # one span is not pressed down by its patch
-    row = np.interp(np.asarray(law.readings), [-flat_from, 0.0, flat_from], ends)
-    return dataclasses.replace(law, values=np.array([row] * law.values.shape[0]))
 
 
 DELAY = 0.02  # s
@@ -112,3 +164,10 @@ EXPERIMENT = Experiment(
     " peak.",
     run,
 )
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        result = tune_law(name)
+        print(result)
+        jb.save_case(result.case, FOLDER / f"{name}.toml", overwrite=True)

@@ -31,14 +31,12 @@ EXCITATIONS = ("1 impact", "3 impacts", "10 impacts", "random force", "two rando
 DURATION = 60.0  # s
 
 
-def forced_log(
-    structure: Structure, excitation: str, seed: int, duration: float = DURATION
-) -> tuple[Log, Planted]:
+def forced_log(structure: Structure, excitation: str, seed: int) -> tuple[Log, Planted]:
     """Log of measured forces and the velocities at the channels, with what was planted in it."""
     random = np.random.default_rng(7000 + seed)
     rate = 2.56 * structure.frequencies[-1] * random.uniform(1.2, 2.5)
     fine = FINER * rate
-    forces = np.zeros((int(duration * fine), structure.inputs.shape[1]))
+    forces = np.zeros((int(DURATION * fine), structure.inputs.shape[1]))
     shakers = {"random force": 1, "two random forces": 2}.get(excitation, 0)
     if shakers:
         forces[:, :shakers] = random.normal(size=(len(forces), shakers))

@@ -11,8 +11,6 @@ import jaxbeam as jb
 from experiments.studies import (
     fragility,
     sensor_feedback,
-    tune_feedforward,
-    tune_sensor_feedback,
     tuned_feedforward,
 )
 from experiments.studies.held_out import RIGIDITY, held_out_loads, training_loads
@@ -27,7 +25,7 @@ from experiments.studies.patch_drift import (
     log_of_patch,
     remaining_errors,
 )
-from experiments.studies.tune_feedforward import COMMAND_LIMITS
+from experiments.studies.tuned_feedforward import COMMAND_LIMITS
 from experiments.thesis.cases import data_physics_v4
 from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
@@ -113,7 +111,7 @@ def test_errors(arguments, message):
 
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_hand_set_laws_stay_within_the_limits(rig):
-    law, table = tuned_feedforward.trapezium(rig), tuned_feedforward.drawn_table(rig)
+    law, table = tuned_feedforward.trapezium(rig), sensor_feedback.drawn_table(rig)
     low, high = COMMAND_LIMITS
     for values in (law.values, table.values):
         assert values.min() >= low and values.max() == high
@@ -243,8 +241,8 @@ def test_the_true_operators_leave_nothing():
 
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_stored_laws_have_the_breakpoints_and_limits_of_the_search(rig):
-    case = jb.load_case(tune_sensor_feedback.FOLDER / f"{rig}.toml")
-    law, start = case.controller, tune_sensor_feedback.initial_law(rig)
+    case = jb.load_case(sensor_feedback.FOLDER / f"{rig}.toml")
+    law, start = case.controller, sensor_feedback.initial_law(rig)
     np.testing.assert_allclose(law.readings, start.readings)
     assert law.values.shape == start.values.shape
     assert np.all((law.values >= -2.5) & (law.values <= 7.5))
@@ -258,8 +256,8 @@ def test_stored_laws_have_the_breakpoints_and_limits_of_the_search(rig):
 @pytest.mark.parametrize("number", ["mass", "speed", "entry_time"])
 def test_held_out_loads_are_not_among_the_training_loads(rig, number):
     address = f"loads.0.{number}"
-    changes = tune_sensor_feedback.plant_changes(rig)
-    training = training_loads(tune_sensor_feedback.SPEEDS, changes)
+    changes = sensor_feedback.plant_changes(rig)
+    training = training_loads(sensor_feedback.SPEEDS, changes)
     held_out = {load[address] for load in held_out_loads(rig)}
     assert {load[address] for load in training}.isdisjoint(held_out)
 
@@ -267,7 +265,7 @@ def test_held_out_loads_are_not_among_the_training_loads(rig, number):
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_held_out_noise_has_another_seed(rig):
     bench = sensor_feedback.bench_case(rig, rigs.load(rig))
-    assert bench.run.seed != tune_sensor_feedback.with_noise_and_filters(rig, bench).run.seed
+    assert bench.run.seed != sensor_feedback.with_noise_and_filters(rig, bench).run.seed
 
 
 def test_peak_of_a_held_out_load_is_near_the_least_achievable():
@@ -286,8 +284,8 @@ def changed_plant(rig, side, factor, run=None):
     bench = dataclasses.replace(bench, beam=dataclasses.replace(bench.beam, modes=3))
     law = dataclasses.replace(
         bench.controller,
-        delay=np.asarray(tune_sensor_feedback.DELAY + 0.01),
-        readings=bench.controller.readings + side * tune_sensor_feedback.READING_OFFSET,
+        delay=np.asarray(sensor_feedback.DELAY + 0.01),
+        readings=bench.controller.readings + side * sensor_feedback.READING_OFFSET,
     )
     case = jb.replace(dataclasses.replace(bench, controller=law), run or {})
     design = {RIGIDITY: float(case.beam.flexural_rigidity)}
@@ -347,8 +345,8 @@ def test_force_under_a_force_loop():
 
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_stored_feedforward_has_the_breakpoints_and_limits_of_the_search(rig):
-    law = jb.load_case(tune_feedforward.FOLDER / f"{rig}.toml").controller
-    start = tune_feedforward.initial_law(rig)
+    law = jb.load_case(tuned_feedforward.FOLDER / f"{rig}.toml").controller
+    start = tuned_feedforward.initial_law(rig)
     assert law.values.shape == start.values.shape
     np.testing.assert_allclose(law.shares, start.shares)
     assert np.all((law.values >= -2.5) & (law.values <= 7.5))
@@ -361,13 +359,13 @@ def test_stored_feedforward_has_the_breakpoints_and_limits_of_the_search(rig):
 @pytest.mark.parametrize("number", ["mass", "speed", "entry_time"])
 def test_held_out_feedforward_loads_are_not_among_the_training_loads(rig, number):
     address = f"loads.0.{number}"
-    training = {load[address] for load in training_loads(tune_feedforward.SPEEDS[rig])}
+    training = {load[address] for load in training_loads(tuned_feedforward.SPEEDS[rig])}
     assert training.isdisjoint({load[address] for load in held_out_loads(rig)})
 
 
 def test_feedforward_peak_of_a_held_out_load_is_near_the_least_achievable():
     """On the bench, with the rig's own beam, against the linear program."""
-    stored = jb.load_case(tune_feedforward.FOLDER / "B.toml").controller
+    stored = jb.load_case(tuned_feedforward.FOLDER / "B.toml").controller
     law = tuned_feedforward.with_bench_delay(stored)
     case = dataclasses.replace(rigs.load("B"), controller=law, run=jb.Run(0.85, 200.0))
     case = jb.replace(

@@ -198,7 +198,7 @@ def hermite_peaks(interval, value, rate):
     return xp.maximum(abs(value).max(0), abs(inside).max(0))
 
 
-def free_times(beam, free, tolerance=1e-7):
+def free_times(beam, tolerance=1e-7):
     """Times at which cubics through the free vibration are right to `tolerance`, (time,) in s.
 
     The error of a cubic is h^4 w'''' / 384. Mode j is assumed to start with w_1 / w_j of the peak,
@@ -206,10 +206,10 @@ def free_times(beam, free, tolerance=1e-7):
     """
     ratio = beam.frequencies / beam.frequencies[0]
     times = [0.0]
-    while times[-1] < free:
+    while times[-1] < FREE_VIBRATION:
         alive = np.exp(-beam.damping_ratio * beam.frequencies * times[-1]) / ratio
         times.append(times[-1] + (384 * tolerance / (alive @ beam.frequencies**4)) ** 0.25)
-    return np.array([*times[:-1], free])
+    return np.array([*times[:-1], FREE_VIBRATION])
 
 
 def free_vibration(beam, times, q, velocity):
@@ -240,13 +240,13 @@ REFERENCE_TOLERANCE = 1e-12
 SCIPY_TOLERANCE = 5e-8  # errors of peaks up to 5e-7; with twice that, some exceed 1e-6
 
 
-def reference_peaks(beam, masses, speeds, free=FREE_VIBRATION):
+def reference_peaks(beam, masses, speeds):
     """Reference peaks (mass, speed, sensor) in m, right to about 1e-10.
 
     As `scipy_peaks` at the limit of double precision, with all masses of one speed integrated as
     one system, which shares their steps and Python's overhead.
     """
-    masses, times = np.asarray(masses), free_times(beam, free, tolerance=1e-10)
+    masses, times = np.asarray(masses), free_times(beam, tolerance=1e-10)
     runs = [
         _scipy_runs(beam, masses, v, times, tolerance=REFERENCE_TOLERANCE, samples=8)
         for v in speeds
@@ -254,12 +254,9 @@ def reference_peaks(beam, masses, speeds, free=FREE_VIBRATION):
     return np.stack(runs, axis=1)
 
 
-def scipy_peaks(beam, masses, speeds, free=FREE_VIBRATION):
-    """Peaks by DOP853 in a loop, run by run, (mass, speed, sensor) in m.
-
-    Masses in kg, speeds in m/s, `free` in s.
-    """
-    times = free_times(beam, free)
+def scipy_peaks(beam, masses, speeds):
+    """Peaks by DOP853 in a loop, run by run, (mass, speed, sensor) in m, for kg and m/s."""
+    times = free_times(beam)
 
     def run(mass, speed):
         return _scipy_runs(
@@ -304,16 +301,16 @@ def scipy_time(solve, beam, masses, speeds, runs=12, repeat=3, reference=None):
     )
 
 
-@partial(jax.jit, static_argnames=("beam", "free", "shared_steps"))
-def diffrax_peaks(beam, masses, speeds, free=FREE_VIBRATION, shared_steps=False):
+@partial(jax.jit, static_argnames=("beam", "shared_steps"))
+def diffrax_peaks(beam, masses, speeds, shared_steps=False):
     """Peaks by diffrax, mapped over speeds and batched over masses, (mass, speed, sensor) in m.
 
-    Masses in kg, speeds in m/s, `free` in s. Every run has its own adaptive steps (`vmap`), or
+    Masses in kg, speeds in m/s. Every run has its own adaptive steps (`vmap`), or
     with `shared_steps` all masses of a speed are one system, with steps for the largest error: that
     avoids the selects which `vmap` puts around every step, and is several times faster. Failed runs
     are NaN.
     """
-    times = free_times(beam, free)
+    times = free_times(beam)
 
     def at_speed(speed):
         if shared_steps:

@@ -12,7 +12,7 @@ from types import ModuleType
 import diffrax
 import numpy as np
 
-from experiments.benchmarks.rivals.baselines import FREE_VIBRATION, GRAVITY, free_times
+from experiments.benchmarks.rivals.baselines import GRAVITY, free_times
 
 TOLERANCE = 1e-8  # errors of the peaks of the benchmark's grid stay below 1e-6
 SOLVER, ORDER = diffrax.Dopri5, 5  # faster here than Tsit5 and Dopri8, with 3 modes and with 12
@@ -162,7 +162,7 @@ def compile_peaks(package: ModuleType | None):
     return fill
 
 
-def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
+def numba_peaks(peak_function, beam, masses, speeds):
     """Peaks (mass, speed, sensor) in m by the function that `compile_peaks` returns.
 
     Masses in kg, speeds in m/s; for beams of one span without control.
@@ -182,7 +182,7 @@ def numba_peaks(peak_function, beam, masses, speeds, free=FREE_VIBRATION):
         damping,
         float(beam.mode_amplitudes[0]),
     )
-    times = free_times(beam, free)
+    times = free_times(beam)
     decays = np.exp(np.outer(times, beam.poles))
     peaks = np.zeros((len(masses), len(speeds), len(beam.sensors)))
     swept_values = np.asarray(masses, float), np.asarray(speeds, float)

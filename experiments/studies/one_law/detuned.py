@@ -45,11 +45,6 @@ WORST_CASE = np.array([1.0, 0.64, 0.14, 0.3, 0.39, 0.59, 0.69, 0.82, 0.93, 1.0, 
 HEADER = "rigidity", "not known", "known to the law", "law for the worst case", "other loads"
 
 
-def with_known_rigidity(case: jb.Case, factor: float) -> jb.Case:
-    """Case with a factor on its rigidity, for which its law is designed too."""
-    return jb.replace(case, {RIGIDITY: factor * float(case.beam.flexural_rigidity)})
-
-
 def outer_loads(rig: str) -> tuple[AddressValues, ...]:
     """Loads lighter, heavier and faster than those of the search, as numbers by address."""
     return tuning.full_grid(
@@ -75,9 +70,13 @@ def over_delays(
 def row(rig: str, factor: float, shares: Shares) -> tuple[str, ...]:
     """Cells of a rig and a factor on its rigidity."""
     held_out, others = held_out_loads(rig), outer_loads(rig)
+
+    def with_known_rigidity(case):
+        return jb.replace(case, {RIGIDITY: factor * float(case.beam.flexural_rigidity)})
+
     ways = (
         (lambda case: with_rigidity(case, factor), held_out),
-        (lambda case: with_known_rigidity(case, factor), held_out),
+        (with_known_rigidity, held_out),
         (lambda case: with_rigidity(with_numbers(case, WORST_CASE), factor), held_out),
         (lambda case: with_rigidity(case, factor), others),
     )

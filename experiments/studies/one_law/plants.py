@@ -23,9 +23,8 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.studies.held_out import PERIOD, held_out_loads
-from experiments.studies.sensor_feedback import bench_case, with_cutoff
-from experiments.studies.tune_feedforward import COMMAND_RESOLUTION, MODES
-from experiments.studies.tuned_feedforward import drawn_table
+from experiments.studies.sensor_feedback import bench_case, drawn_table, with_cutoff
+from experiments.studies.tuned_feedforward import COMMAND_RESOLUTION, MODES
 from experiments.thesis.cases import with_modes
 from jaxbeam import rigs
 from jaxbeam.model.modes import mesh_layout

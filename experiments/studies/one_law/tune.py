@@ -52,10 +52,10 @@ def mean_and_worst(shares: np.ndarray) -> float:
     return float(0.6 * found[0] + 0.4 * found[:WORST_RUNS].mean() + MEAN_WEIGHT * found.mean())
 
 
-def merit(numbers: np.ndarray, shares: Shares, rigs=("B", "C")) -> float:
+def merit(numbers: np.ndarray, shares: Shares) -> float:
     """Weighted worst, worst few and mean of the shares of all runs."""
     found = []
-    for rig, delay, factor in itertools.product(rigs, DELAYS, FACTORS):
+    for rig, delay, factor in itertools.product("BC", DELAYS, FACTORS):
         case = with_numbers(plant_case(rig, ONE_LAW, CUTOFF, delay, factor), numbers)
         found.append(shares(rig, case, training_loads(SPEEDS[rig])))
     return mean_and_worst(np.concatenate(found))

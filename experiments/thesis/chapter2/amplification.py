@@ -27,13 +27,7 @@ from experiments.thesis.cases import (
 )
 from experiments.thesis.chapter2 import published
 from experiments.thesis.chapter2.shaker import beams_of_rig_a
-from experiments.thesis.verdicts import (
-    LITERAL,
-    Experiment,
-    ExperimentResult,
-    Finding,
-    make_finding,
-)
+from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.model.plausibility.check import PlausibilityWarning
 from jaxbeam.model.statics import static_peak
 from jaxbeam.plot.style import GREY, INK, SHADE, colour, set_title, unit_scale, use_style

@@ -38,13 +38,7 @@ from experiments.thesis.chapter5.regulators import (
     time_varying_loops,
 )
 from experiments.thesis.report import plot_commands, plot_deflections
-from experiments.thesis.verdicts import (
-    LITERAL,
-    Experiment,
-    ExperimentResult,
-    Finding,
-    make_finding,
-)
+from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import COLOURS, colour, set_title, use_style

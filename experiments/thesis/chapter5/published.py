@@ -1,11 +1,6 @@
 """Chapter 5: optimal control of one span with a shaker."""
 
-from experiments.thesis.verdicts import (
-    SAME_CURVE,
-    YES_OR_NO,
-    PublishedNumbers,
-    measured_shares,
-)
+from experiments.thesis.verdicts import SAME_CURVE, YES_OR_NO, PublishedNumbers, measured_shares
 
 # Optimal control of one span with a shaker, peaks at 0.25 m in percent of no control.
 RIG_A = "rig A, chapter 5"

@@ -158,14 +158,14 @@ class BestGain(NamedTuple):
 
 
 def equivalent_gains(
-    case: Case, masses: ArrayLike, gain: float, power: int = 3
+    case: Case, masses: ArrayLike, gain: float
 ) -> Float[np.ndarray, "actuator mass"]:
-    """Linear gains with the same largest static deflections as a power law, for masses in kg.
+    """Linear gains with the same largest static deflections as a cubic law, for masses in kg.
 
     Each loop alone, with the load at the position of the largest deflection: the deflection w under
-    u = -gain w |w|^(power - 1) satisfies s m = w + h gain w^power, with s the deflection per
-    kilogram and h that per unit of command, and the gain is k = gain w^(power - 1), in commands per
-    m. Speed, filters, limits and other loops are left out.
+    u = -gain w^3 satisfies s m = w + h gain w^3, with s the deflection per kilogram and h that per
+    unit of command, and the gain is k = gain w^2, in commands per m. Speed, filters, limits and
+    other loops are left out.
 
     Raises ValueError for an invalid case or one with fewer sensors than actuators.
     """
@@ -183,9 +183,9 @@ def equivalent_gains(
 
     def equivalent_gain(uncontrolled, unit_response):
         def residual(w):
-            return w + unit_response * gain * w**power - uncontrolled
+            return w + unit_response * gain * w**3 - uncontrolled
 
-        return gain * scipy.optimize.brentq(residual, 0.0, uncontrolled, xtol=1e-15) ** (power - 1)
+        return gain * scipy.optimize.brentq(residual, 0.0, uncontrolled, xtol=1e-15) ** 2
 
     rows = zip(static_deflections, per_command, strict=True)
     return np.array(

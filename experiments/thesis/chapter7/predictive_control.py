@@ -135,7 +135,9 @@ def _two_spans(case):
     """Findings and records of rig C."""
     free = jb.simulate(case, tolerance=TOLERANCE)
     short, long = simulate_mpc(case, 4, 3), simulate_mpc(case, 6, 4)
-    by_short, by_long = (_reductions_by_half(free, one) for one in (short, long))
+    by_short, by_long = (
+        reduction(_peaks_by_half(free), _peaks_by_half(one)) for one in (short, long)
+    )
     no_control = "no control", 0.0
     findings = (
         make_finding(published.TWO_SPAN_REDUCTION, by_short[PRINTED_REDUCTIONS], null=no_control),
@@ -201,11 +203,6 @@ def _unattainable_reductions(case: jb.Case) -> str:
         f" damping are printed, nor at {min(OTHER_SPEEDS):g} to {max(OTHER_SPEEDS):g} m/s on the"
         " beam of the rig (a linear program, which knows the load)"
     )
-
-
-def _reductions_by_half(uncontrolled: jb.Record, controlled: jb.Record) -> np.ndarray:
-    """Reductions (%) of the peaks in the first and second half of the crossing (half, sensor)."""
-    return reduction(_peaks_by_half(uncontrolled), _peaks_by_half(controlled))
 
 
 def _saturation_time(

@@ -1,10 +1,6 @@
 """Chapter 7: model predictive control of one and two spans with patches."""
 
-from experiments.thesis.verdicts import (
-    SAMPLE_INSTANT,
-    YES_OR_NO,
-    PublishedNumbers,
-)
+from experiments.thesis.verdicts import SAMPLE_INSTANT, YES_OR_NO, PublishedNumbers
 
 RIG_B, RIG_C = "rig B, chapter 7", "rig C, chapter 7"
 

@@ -67,7 +67,7 @@ def test_cubic_peaks_are_exact_for_a_cubic_and_need_no_sample_at_the_peak():
 
 
 def test_free_times_cover_the_duration_and_thin_out_as_high_modes_decay():
-    times = free_times(PinnedBeam(12), 0.5)
+    times = free_times(PinnedBeam(12))
     assert times[0] == 0.0 and times[-1] == 0.5
     assert np.all(np.diff(times) > 0)
     assert times[-2] - times[-3] > 5 * times[1]
