@@ -60,8 +60,8 @@ def test_what_is_public_is_documented_with_what_it_raises():
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples_in_docstrings_print_what_they_show(name, tmp_path, monkeypatch):
-    """In a folder with the fit that examples read."""
-    shutil.copy(ROOT / "tests" / "data" / "release_0_2_0" / "fit.npz", tmp_path)
+    """In a folder with the case and the fit that examples read."""
+    shutil.copytree(ROOT / "tests" / "data" / "examples", tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     results = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
     assert results.attempted and not results.failed

@@ -21,9 +21,8 @@ from tuning.fit.modal_parameters import identify_from_modes
 from tuning.fit.result import load_fit, save_fit
 from tuning.logs.log import Log
 from tuning.logs.reading import read_log, read_logs
-from tuning.modal.arguments import ModalSettings
 from tuning.modal.fit import ModalFit
-from tuning.modal.identify_modes import identify_modes
+from tuning.modal.identify_modes import ModalSettings, identify_modes
 from tuning.parameters import Prior
 from tuning.weighing.weigh import weigh
 

@@ -68,7 +68,9 @@ COMMON_ARGUMENTS = """Some arguments mean the same everywhere: ``case`` is a
 :py:obj:`Case <jaxbeam.Case>`, ``record`` a :py:obj:`Record <jaxbeam.Record>`, ``fit`` a
 :py:obj:`Fit <tuning.Fit>`, ``path`` the path of a file, ``seed`` the seed of random numbers,
 ``progress`` whether a bar is shown, and ``layout`` the order of the nodes of a beam, which is
-needed inside ``jit`` only."""
+needed inside ``jit`` only. Examples read ``case.toml``, the case of the example of
+:py:obj:`tune <tuning.tune>`, and ``fit.npz``, the fit of that of
+:py:obj:`identify <tuning.identify>`."""
 
 
 def group_of(module: str) -> str:

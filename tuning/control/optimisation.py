@@ -23,11 +23,7 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.runtime.progress import ProgressBar, found_so_far
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint
 from tuning.control.objective import Objective, WeightsAndLimits
-from tuning.control.penalised_objective import (
-    PenalisedObjective,
-    true_values,
-    values_and_gradients,
-)
+from tuning.control.penalised_objective import PenalisedObjective, true_values, values_and_gradients
 from tuning.control.run_set import RunSet
 from tuning.parameters import FreeParameter, to_unbounded
 

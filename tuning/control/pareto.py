@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, addresses
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.control.lqr import LQR
+from jaxbeam.files.case_file import with_settings
 from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
-from tuning.control.objective import ALL_METRICS, Objective
+from tuning.control.objective import Objective
 from tuning.control.penalised_objective import StabilityConstraint
 from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments, tune
 from tuning.control.tuning_result import TuningResult
@@ -84,14 +85,7 @@ def pareto(
 
     >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
-    ...     run=jb.Run(0.3),
-    ... )
+    >>> case = jb.load_case("case.toml")
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.gains.0": (100.0, 5000.0)}
     >>> options = {"steps": 3, "least_peaks": False, "progress": False}
@@ -101,7 +95,10 @@ def pareto(
     (0.5, 0.1)
     """
     limits = tuple(sorted(map(float, limits), reverse=True))
-    objectives = [_with_limits(objective, {metric: limit}) for limit in limits]
+    objectives = [
+        dataclasses.replace(objective, limits=objective.limits | {metric: limit})
+        for limit in limits
+    ]
     if not objectives:
         raise ValueError(f"a Pareto front needs at least one limit of {metric}, such as [0.1, 0.2]")
     check_arguments(free, cases, objectives[0], method, steps, least_peaks=least_peaks)
@@ -137,14 +134,7 @@ def lexicographic(
 
     >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
-    ...     run=jb.Run(0.3),
-    ... )
+    >>> case = jb.load_case("case.toml")
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.gains.0": (100.0, 5000.0)}
     >>> options = {"steps": 3, "least_peaks": False, "progress": False}
@@ -187,11 +177,9 @@ def _tune_successively(
         yield problem.tuning_result(optimisation, state, objective)
 
 
-def _with_limits(objective: Objective, limits: dict[str, float]) -> Objective:
-    unknown = set(limits) - set(ALL_METRICS)
-    if unknown:
-        raise ValueError(f"there is no metric {min(unknown)!r}; it may be {', '.join(ALL_METRICS)}")
-    return dataclasses.replace(objective, limits=objective.limits | limits)
+def _rank(found: TuningResult) -> tuple[bool, float]:
+    """The objective on training runs; results that violate the stability constraint come last."""
+    return found.stability_violation > 0, found.run_sets[0].objective[1]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -204,10 +192,7 @@ class IntegerSearchResult:
     @property
     def best(self) -> TuningResult:
         """The result with the lowest objective on training runs; stable ones come first."""
-        ranks = [
-            (found.stability_violation > 0, found.run_sets[0].objective[1]) for found in self.tuned
-        ]
-        return self.tuned[min(range(len(ranks)), key=ranks.__getitem__)]
+        return min(self.tuned, key=_rank)
 
     def __str__(self) -> str:
         names = list(self.choices[0])
@@ -238,16 +223,11 @@ def tune_integers(
 
     Raises ValueError for an address without an integer, and as `tune` does.
 
+    >>> import dataclasses
     >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    ...     controller=jb.MPC(horizon=4, moves=2, move_weight=1e-9, period=0.01),
-    ...     run=jb.Run(0.3),
-    ... )
+    >>> law = jb.MPC(horizon=4, moves=2, move_weight=1e-9, period=0.01)
+    >>> case = dataclasses.replace(jb.load_case("case.toml"), controller=law)
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> options = {"steps": 1, "least_peaks": False, "progress": False}
     >>> free = {"controller.move_weight": (1e-10, 1e-8)}
@@ -270,36 +250,10 @@ def with_integers(case: Case, values: Mapping[str, int]) -> Case:
 
     Raises ValueError for an address at which there is no integer.
     """
-    for address, value in values.items():
-        case = _replace_integer(case, address.split("."), int(value), address)
-    return case
-
-
-def _replace_integer(part, path: list[str], value: int, address: str):
-    """A part of a case with the integer at the path within it replaced."""
-    step, *rest = path
-    if isinstance(part, tuple):
-        if not (step.isdigit() and int(step) < len(part)):
-            raise ValueError(f"the case has nothing at {address}")
-        entries = list(part)
-        entries[int(step)] = _replace_integer(entries[int(step)], rest, value, address)
-        return tuple(entries)
-    names = (
-        [field.name for field in dataclasses.fields(part)] if _is_dataclass_instance(part) else []
-    )
-    if step not in names:
-        hint = f"; there it has {', '.join(names)}" if names else ""
-        raise ValueError(f"the case has nothing at {address}{hint}")
-    old = getattr(part, step)
-    if rest:
-        return dataclasses.replace(part, **{step: _replace_integer(old, rest, value, address)})
-    if isinstance(old, bool) or not isinstance(old, (int, np.integer)):
-        raise ValueError(f"{address} is no integer: tune it as a free parameter")
-    return dataclasses.replace(part, **{step: value})
-
-
-def _is_dataclass_instance(part) -> bool:
-    return dataclasses.is_dataclass(part) and not isinstance(part, type)
+    for address in values:
+        if address in addresses(case):
+            raise ValueError(f"{address} is no integer: tune it as a free parameter")
+    return with_settings(case, {address: int(value) for address, value in values.items()})
 
 
 FEEDBACK_ADDRESS = "controller.feedback"
@@ -356,16 +310,11 @@ def tune_reduced(
     Raises ValueError for a controller that is no regulator, for more states than it has, and as
     `tune` does.
 
+    >>> import dataclasses
     >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    ...     controller=jb.LQR(state_weight=[1e6, 1.0], command_weight=[1e-2], period=0.01),
-    ...     run=jb.Run(0.3),
-    ... )
+    >>> law = jb.LQR(state_weight=[1e6, 1.0], command_weight=[1e-2], period=0.01)
+    >>> case = dataclasses.replace(jb.load_case("case.toml"), controller=law)
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.command_weight.0": (1e-4, 1.0)}
     >>> options = {"steps": 2, "least_peaks": False, "progress": False}
@@ -397,9 +346,8 @@ def tune_reduced(
         penalty=penalty,
         **options,
     )
-    pairs = zip(relaxed.parameters, relaxed.values, strict=True)
-    found = {parameter.address: value for parameter, value in pairs}
-    shares = np.array([found[name] for name in names])
+    found = [parameter.address for parameter in relaxed.parameters]
+    shares = np.array([relaxed.values[found.index(name)] for name in names])
     order = np.argsort(-shares, kind="stable")
     # The best relaxed fractions need not be the best when rounded.
     candidates = [
@@ -409,10 +357,7 @@ def tune_reduced(
     for kept in candidates:
         rounded = _with_feedback(relaxed.case, np.isin(np.arange(states), kept).astype(float))
         results.append(tune(rounded, free, cases, objective, **options))
-    best = min(
-        range(len(candidates)),
-        key=lambda i: (results[i].stability_violation > 0, results[i].run_sets[0].objective[1]),
-    )
+    best = min(range(len(candidates)), key=lambda i: _rank(results[i]))
     return ReducedFeedback(
         tuple(sorted(map(int, candidates[best]))), shares, relaxed, results[best]
     )

@@ -47,7 +47,7 @@ def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
     >>> round(float(tuning.control.with_identified_plant(fit.case, fit).beam.flexural_rigidity), 2)
-    11.0
+    12.02
     """
     values = found.means if isinstance(found, Posterior) else found.values
     return replace(case, _plant_values(found.addresses, values))
@@ -70,7 +70,7 @@ def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[Addr
     >>> fit = tuning.load_fit("fit.npz")
     >>> plants = tuning.control.draw_plants(fit, 2, seed=1)
     >>> [round(one["beam.flexural_rigidity"], 2) for one in plants]
-    [11.15, 10.72]
+    [12.04, 12.0]
     """
     if count < 1:
         raise ValueError(f"the number of plants must be 1 or more, not {count}")

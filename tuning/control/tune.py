@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import no_bound
 from jaxbeam.case.case import Case, replace
@@ -287,17 +287,12 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
         peaks_after=peaks[1],
         least_peaks=run_set.uncontrolled["least"],
         saturated_share=np.array(
-            [_saturated_fraction(np.asarray(record.saturated)) for record in pairs[1]]
+            [record.saturated.mean() if record.saturated.size else 0.0 for record in pairs[1]]
         ),
         objective=[float(objective.aggregate(own)) for own in values],
         metrics=metrics_after,
         metrics_before=metrics_before,
     )
-
-
-def _saturated_fraction(saturated: Bool[np.ndarray, "time actuator"]) -> float:
-    """Fraction of the time at a limit, over all actuators; 0 without any."""
-    return float(saturated.mean()) if saturated.size else 0.0
 
 
 def _histories(records: list[Record], run_set: RunSet) -> Histories:

@@ -54,6 +54,16 @@ class RunSetResult:
         """Fraction of the attainable reduction that peaks (m) attain, by run."""
         return (self.uncontrolled_peaks - peaks) / (self.uncontrolled_peaks - self.least_peaks)
 
+    def attained_words(self, peaks: Float[np.ndarray, " run"]) -> str:
+        """Words on the attained shares at the end of a sentence; "" without least peaks."""
+        if not np.isfinite(self.least_peaks).all():
+            return ""
+        shares = self.attained_shares(peaks)
+        return (
+            f"; of the attainable reduction at least {shares.min():.1%},"
+            f" {shares.mean():.1%} in the mean"
+        )
+
 
 class StartResult(NamedTuple):
     """Best point of one of several starts: the objective, penalties included, and the values."""
@@ -73,14 +83,7 @@ class TuningResult(TableViews):
 
     >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
-    ...     run=jb.Run(0.3),
-    ... )
+    >>> case = jb.load_case("case.toml")
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.gains.0": (100.0, 5000.0)}
     >>> options = {"steps": 3, "least_peaks": False, "progress": False}
@@ -111,11 +114,8 @@ class TuningResult(TableViews):
         return {
             name: amount
             for name, amount in found.items()
-            if amount > LIMIT_TOLERANCE * self._limit(name)
+            if amount > LIMIT_TOLERANCE * self.objective.limits[name]
         }
-
-    def _limit(self, name: str) -> float:
-        return self.objective.limits[name]
 
     @property
     def verdict(self) -> str:
@@ -132,12 +132,8 @@ class TuningResult(TableViews):
             f"; worst {last.name} run: peak {against_no_control(reductions[worst])}"
             f" ({against_no_control(before, reductions[worst])} before tuning)"
         )
-        if np.isfinite(last.least_peaks).all():
-            shares = last.attained_shares(last.peaks_after)
-            sentence += (
-                f"; of the attainable reduction at least {shares.min():.1%},"
-                f" {shares.mean():.1%} in the mean"
-            )
+        if attained := last.attained_words(last.peaks_after):
+            sentence += attained
         elif obstacle := no_bound(self.case):
             sentence += f"; no least achievable peaks, as {obstacle}"
         if self.stability_violation > 0:
@@ -146,7 +142,8 @@ class TuningResult(TableViews):
                 f" {self.stability_violation:.3g} 1/s too large"
             )
         for name, amount in self.limit_excess.items():
-            sentence += f"; {name} exceeds its limit of {self._limit(name):.4g} by {amount:.3g}"
+            limit = self.objective.limits[name]
+            sentence += f"; {name} exceeds its limit of {limit:.4g} by {amount:.3g}"
         if last.name == "training":
             sentence += "; nothing was held out, so this proves nothing for other loads"
         return sentence
@@ -163,9 +160,10 @@ class TuningResult(TableViews):
 
     def __str__(self) -> str:
         pairs = zip(self.parameters, self.values, strict=True)
+        marks = {True: "(at a bound)", False: ""}
         rows = [
-            (p.address, f"{p.start:.6g}", f"{value:.6g}", p.unit, _bound_mark(p, value))
-            for p, value in pairs
+            (p.address, f"{p.start:.6g}", f"{x:.6g}", p.unit, marks[bool(p.at_bound(x))])
+            for p, x in pairs
         ]
         lines = text_table(("parameter", "before", "after", "unit", ""), rows, "<>><<")
         for outcome in self.run_sets:
@@ -287,10 +285,6 @@ def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
     return lines
 
 
-def _bound_mark(parameter: FreeParameter, value: float) -> str:
-    return "(at a bound)" if parameter.at_bound(value) else ""
-
-
 def _run_table(run_set: RunSetResult) -> list[str]:
     """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
     varied = value_columns(run_set.runs)
@@ -340,7 +334,7 @@ def compare_runs(
     """
     laws = with_hand_drawn(case, controllers)
     free = dataclasses.replace(case, controller=None)
-    return [_compare_run(free, laws, run, period) for run in runs]
+    return [compare(*_changed(free, laws, run), period) for run in runs]
 
 
 def with_hand_drawn(
@@ -383,26 +377,16 @@ def hand_drawn_peaks(case: Case, runs: Sequence[AddressValues]) -> Float[np.ndar
 def hand_drawn_sentence(outcome: RunSetResult, peaks: Float[np.ndarray, " run"]) -> str:
     """Sentence on the peaks (m) under the law drawn by hand in the runs of a tuning."""
     reductions = 1 - peaks / outcome.uncontrolled_peaks
-    words = (
+    return (
         f"drawn by hand, with no number tuned: worst {outcome.name} run: peak"
-        f" {against_no_control(reductions.min())}"
+        f" {against_no_control(reductions.min())}{outcome.attained_words(peaks)}"
     )
-    if np.isfinite(outcome.least_peaks).all():
-        shares = outcome.attained_shares(peaks)
-        words += f"; of the attainable reduction at least {shares.min():.1%}, {shares.mean():.1%}"
-        words += " in the mean"
-    return words
-
-
-def _compare_run(case: Case, laws, run: AddressValues, period) -> Comparison:
-    """Comparison on one run."""
-    return compare(*_changed(case, laws, run), period)
 
 
 def _changed(case: Case, laws, run: AddressValues) -> tuple[Case, dict[str, AbstractController]]:
     """Case of a run, and the laws designed for the case as it is, with the settings of the run."""
-    settings = {a.removeprefix(OF_CONTROLLER): v for a, v in run.items() if _is_setting(a)}
-    others = {address: value for address, value in run.items() if not _is_setting(address)}
+    others = {a: value for a, value in run.items() if not a.startswith(OF_CONTROLLER)}
+    settings = {a.removeprefix(OF_CONTROLLER): run[a] for a in run if a not in others}
     changed = run_case(case, others)
     nominal = {a: value_at(case, a) for a in others if a.startswith(PLANT_PREFIXES)}
     layout = mesh_layout(changed)
@@ -411,10 +395,6 @@ def _changed(case: Case, laws, run: AddressValues) -> tuple[Case, dict[str, Abst
         one = _with_settings(dataclasses.replace(changed, controller=law), settings)
         controllers[name] = with_fixed_design(one, nominal, layout).controller
     return changed, controllers
-
-
-def _is_setting(address: str) -> bool:
-    return address.startswith(OF_CONTROLLER)
 
 
 def _with_settings(case: Case, settings: Mapping[str, float]) -> Case:

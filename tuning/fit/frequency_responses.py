@@ -20,9 +20,9 @@ from jaxbeam.case.fields import OUTSIDE, refuse_traced, refuses_traced
 from jaxbeam.model.frequency_responses import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, confidence_intervals
-from tuning.fit.result import parameter_table
+from tuning.fit.result import ParameterEstimates, parameter_table
 from tuning.logs.log import Log
-from tuning.parameters import FreeParameter, FunctionPrediction, Prior, free_parameters
+from tuning.parameters import FunctionPrediction, Prior, free_parameters
 
 MIN_RELATIVE_SD = 1e-3  # of a measured response; no sensor is better calibrated
 
@@ -163,28 +163,18 @@ class _ResponseData:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ResponseFit:
+class ResponseFit(ParameterEstimates):
     """Parameters fitted to frequency responses (SI units), named as in `tuning.Fit`.
 
     `fitted` are the responses with the fitted values; `relative_misfit` is the root mean square of
     their relative difference from the measured ones.
     """
 
-    parameters: list[FreeParameter]
-    values: Float[np.ndarray, " parameter"]
-    errors: Float[np.ndarray, " parameter"]
-    correlation: Float[np.ndarray, "parameter parameter"]
-    unidentifiable: list[dict[str, float]]
     degrees_of_freedom: float
     verdict: str
     case: Case
     fitted: Complex[np.ndarray, "frequency pair"]
     relative_misfit: Float[np.ndarray, " pair"]
-
-    @property
-    def addresses(self) -> list[str]:
-        """Addresses of the free parameters."""
-        return [parameter.address for parameter in self.parameters]
 
     @property
     def intervals(self) -> Float[np.ndarray, "parameter 2"]:

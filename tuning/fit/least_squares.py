@@ -446,12 +446,12 @@ class LeastSquares:
         strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
         return 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
 
-    def cost(self, values, noise, measured, mask=None) -> float:
+    def cost(self, values, noise, measured) -> float:
         """Half the sum of squared residuals over their noise (or their loss), priors included.
 
         Infinite where the case cannot be simulated.
         """
-        residuals = (measured - self.linearised(values)[0]) * self.weights(noise, mask)
+        residuals = (measured - self.linearised(values)[0]) * self.weights(noise)
         squares = np.sum(robust_residual(self.loss, residuals) ** 2) + np.sum(
             self.prior_residuals(np.asarray(values)) ** 2
         )

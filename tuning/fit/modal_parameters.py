@@ -21,9 +21,9 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.modes import mesh_layout, modes
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH, t_quantile, uncertainty
-from tuning.fit.result import parameter_table
+from tuning.fit.result import ParameterEstimates, parameter_table
 from tuning.modal.result import ModalEstimates, mac_matrix
-from tuning.parameters import FreeParameter, Prior, free_parameters, to_unbounded
+from tuning.parameters import Prior, free_parameters, to_unbounded
 
 MIN_RELATIVE_FREQUENCY_SD = 1e-4  # of a frequency; clocks and temperature allow no better
 MIN_RELATIVE_DAMPING_SD = 1e-2
@@ -32,7 +32,7 @@ MAX_PAIRINGS = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ModalParameterFit:
+class ModalParameterFit(ParameterEstimates):
     """Parameters fitted to identified modes (SI units), named as in `tuning.Fit`.
 
     `pairs` are (identified mode, mode of the case), counted from 0, with their modal assurance
@@ -54,22 +54,12 @@ class ModalParameterFit:
     ['beam.flexural_rigidity'] 7.97e+09 N m^2
     """
 
-    parameters: list[FreeParameter]
-    values: Float[np.ndarray, " parameter"]
-    errors: Float[np.ndarray, " parameter"]
-    correlation: Float[np.ndarray, "parameter parameter"]
-    unidentifiable: list[dict[str, float]]
     quantile: float
     misfit: float
     pairs: tuple[tuple[int, int, float], ...]
     frequencies: Float[np.ndarray, " pair"]
     identified: ModalEstimates
     case: Case
-
-    @property
-    def addresses(self) -> list[str]:
-        """Addresses of the free parameters."""
-        return [parameter.address for parameter in self.parameters]
 
     @property
     def intervals(self) -> Float[np.ndarray, "parameter 2"]:

@@ -124,23 +124,8 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
 
     Raises ValueError for a single log.
 
-    >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
-    ... )
-    >>> logs = []
-    >>> for speed in (2.0, 2.5):
-    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
-    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
-    ...     logs.append(
-    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
-    ...     )
-    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
-    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> fit = tuning.load_fit("fit.npz")
     >>> for held_out in tuning.fit.cross_validate(fit):
     ...     print(held_out.log, held_out.residual_ratio.round(1))
     2.0 m/s [1.]
@@ -166,24 +151,9 @@ def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
 
     Raises ValueError as `identify` does for logs that do not match the case.
 
-    >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
-    ... )
-    >>> logs = []
-    >>> for speed in (2.0, 2.5):
-    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
-    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
-    ...     logs.append(
-    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
-    ...     )
-    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
-    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
-    >>> for held_out in tuning.fit.predict_held_out(fit, logs[:1]):
+    >>> fit = tuning.load_fit("fit.npz")
+    >>> for held_out in tuning.fit.predict_held_out(fit, fit.dataset.logs[:1]):
     ...     print(held_out.log, held_out.residual_ratio.round(1))
     2.0 m/s [1.]
     """

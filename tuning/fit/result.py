@@ -173,7 +173,26 @@ def log_remarks(logs: Sequence[Log]) -> Iterator[str]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit(TableViews):
+class ParameterEstimates:
+    """Parameters fitted to measurements (SI units), with standard errors and their correlation.
+
+    `unidentifiable` are directions (changes by address) that the data do not tell.
+    """
+
+    parameters: list[FreeParameter]
+    values: Float[np.ndarray, " parameter"]
+    errors: Float[np.ndarray, " parameter"]
+    correlation: Float[np.ndarray, "parameter parameter"]
+    unidentifiable: list[dict[str, float]]
+
+    @property
+    def addresses(self) -> list[str]:
+        """Addresses of the free parameters."""
+        return [parameter.address for parameter in self.parameters]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit(ParameterEstimates, TableViews):
     """Result of an identification, in SI units and the order of `parameters`.
 
     `errors` are standard errors, infinite for parameters that are not identifiable from the data;
@@ -188,16 +207,11 @@ class Fit(TableViews):
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
     >>> print(
-    ...     fit.addresses[0], f"{fit.values[0]:.0f} +- {fit.errors[0]:.1f} N m^2,", fit.search
+    ...     fit.addresses[0], f"{fit.values[0]:.2f} +- {fit.errors[0]:.2f} N m^2,", fit.search
     ... )
-    beam.flexural_rigidity 11 +- 0.2 N m^2, converged
+    beam.flexural_rigidity 12.02 +- 0.02 N m^2, converged
     """
 
-    parameters: list[FreeParameter]
-    values: Float[np.ndarray, " parameter"]
-    errors: Float[np.ndarray, " parameter"]
-    correlation: Float[np.ndarray, "parameter parameter"]
-    unidentifiable: list[dict[str, float]]
     noise: Float[np.ndarray, "log channel"]
     search: str
     case: Case
@@ -231,11 +245,6 @@ class Fit(TableViews):
         """Noise widened for autocorrelation; 1 where a log lacks the sensor."""
         widened = self.noise * np.sqrt(self.autocorrelation_factor)
         return np.where(np.isnan(self.noise), 1.0, widened)
-
-    @property
-    def addresses(self) -> list[str]:
-        """Addresses of the free parameters."""
-        return [parameter.address for parameter in self.parameters]
 
     @property
     def start_values(self) -> Float[np.ndarray, " parameter"]:
@@ -463,7 +472,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
 
     >>> import tuning
     >>> print(str(tuning.load_fit("fit.npz")).splitlines()[3])
-    beam.flexural_rigidity  N m^2   12.1      11  10.545 to 11.455
+    beam.flexural_rigidity  N m^2     10  12.024  11.99 to 12.059
     """
     path = Path(path)
     if not path.is_file():

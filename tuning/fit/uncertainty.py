@@ -6,7 +6,7 @@ extra `bayes`. Profiles are of the misfit over a parameter.
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -75,17 +75,13 @@ class Posterior(TableViews):
         draws = f"{self.effective_draws.min():.0f} effective draws"
         return f"mixed: R-hat up to {self.r_hat.max():.3f}, {draws}"
 
+    def _rows(self) -> Iterator[tuple]:
+        """Address, mean, deviation, interval, R-hat and effective draws of each parameter."""
+        moments = self.means, self.deviations, self.intervals
+        return zip(self.addresses, *moments, self.r_hat, self.effective_draws, strict=True)
+
     def to_dict(self) -> dict:
         """Means, deviations, intervals and diagnostics by address, and the verdict, for JSON."""
-        rows = zip(
-            self.addresses,
-            self.means,
-            self.deviations,
-            self.intervals,
-            self.r_hat,
-            self.effective_draws,
-            strict=True,
-        )
         numbers = {
             address: {
                 "mean": float(mean),
@@ -94,7 +90,7 @@ class Posterior(TableViews):
                 "r_hat": float(r_hat),
                 "effective_draws": float(effective),
             }
-            for address, mean, deviation, interval, r_hat, effective in rows
+            for address, mean, deviation, interval, r_hat, effective in self._rows()
         }
         return {"numbers": numbers, "verdict": self.verdict}
 
@@ -130,18 +126,9 @@ class Posterior(TableViews):
     @property
     def table(self) -> ReportTable:
         """Table of means, deviations, intervals and diagnostics of the parameters."""
-        columns = zip(
-            self.addresses,
-            self.means,
-            self.deviations,
-            self.intervals,
-            self.r_hat,
-            self.effective_draws,
-            strict=True,
-        )
         rows = [
             (name, f"{mean:.6g}", f"{sd:.2g}", f"{low:.5g} to {high:.5g}", f"{r:.3f}", f"{n:.0f}")
-            for name, mean, sd, (low, high), r, n in columns
+            for name, mean, sd, (low, high), r, n in self._rows()
         ]
         header = ("parameter", "mean", "deviation", "95 % interval", "R-hat", "effective draws")
         return ReportTable(header, rows)
@@ -179,23 +166,8 @@ def sample(
 
     The No-U-Turn sampler runs `chains` at once, and adapts in `warmup` steps that are dropped.
 
-    >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
-    ... )
-    >>> logs = []
-    >>> for speed in (2.0, 2.5):
-    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
-    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
-    ...     logs.append(
-    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
-    ...     )
-    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
-    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> fit = tuning.load_fit("fit.npz")
     >>> posterior = tuning.fit.sample(fit, draws=20, chains=2, warmup=20)
     >>> print(posterior.addresses, f"{posterior.means[0]:.1f}")
     ['beam.flexural_rigidity'] 12.0
@@ -394,23 +366,8 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
 
     The `address` is one of those that were free in the fit.
 
-    >>> import jaxbeam as jb
     >>> import tuning
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
-    ... )
-    >>> logs = []
-    >>> for speed in (2.0, 2.5):
-    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
-    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
-    ...     logs.append(
-    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
-    ...     )
-    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
-    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> fit = tuning.load_fit("fit.npz")
     >>> found = tuning.fit.profile(fit, "beam.flexural_rigidity", points=1)
     >>> print(f"{found.interval[0]:.1f} to {found.interval[1]:.1f} {found.unit}")
     12.0 to 12.1 N m^2

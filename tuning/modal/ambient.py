@@ -22,15 +22,17 @@ from tuning.modal.result import (
     mac_matrix,
     rejection_reason,
 )
-from tuning.modal.stabilisation import Chain, Diagram, stabilise
 from tuning.modal.subspace import (
     MIN_BLOCK_ROWS,
+    Chain,
+    Diagram,
     Poles,
     Spread,
     block_rows,
     decompose,
     poles_of_order,
     spreads,
+    stabilise,
 )
 
 MAX_ORDER = 60  # of models in a stabilisation diagram, by default
@@ -106,14 +108,9 @@ def overlapping(part: tuple[float, float], band: tuple[float, float]) -> tuple[f
     return max(low / BAND_OVERLAP, band[0]), min(high * BAND_OVERLAP, band[1])
 
 
-def mean_square(records):
-    """Mean square of each channel of all records together."""
-    return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
-
-
 def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     """Candidates and diagram of records prepared for one part of the band `whole`."""
-    scale = np.sqrt(mean_square(prepared.records))
+    scale = np.sqrt(np.mean(np.concatenate(prepared.records) ** 2, axis=0))
     scale = np.where(scale > 0, scale, 1.0)
     records = tuple(record / scale for record in prepared.records)
     channels, longest = records[0].shape[1], max(map(len, records))

@@ -13,7 +13,7 @@ from tuning.logs.log import Log
 from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
 from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates, channels_of
-from tuning.modal.stabilisation import Diagram
+from tuning.modal.subspace import Diagram
 
 
 class Choice(NamedTuple):

@@ -16,7 +16,7 @@ from jaxbeam.files.report import page_of, plain_numbers
 from jaxbeam.plot.style import COLOURS, GREY, INK, colour, use_style
 from jaxbeam.runtime.output_file import whole_file
 from tuning.modal.result import ModalEstimates
-from tuning.modal.stabilisation import possible
+from tuning.modal.subspace import possible
 
 LONG = 60  # letters of all names of channels, above which they stand upright
 LINES = ("-", "--", ":")  # of modes whose colours are the same

@@ -24,8 +24,7 @@ from jaxbeam.runtime.progress import ProgressBar
 from tuning.logs.log import LogWarning
 from tuning.logs.readers.headings import epoch_seconds
 from tuning.logs.reading import read_log, version_of
-from tuning.modal.arguments import ModalSettings
-from tuning.modal.identify_modes import identify_modes
+from tuning.modal.identify_modes import ModalSettings, identify_modes
 from tuning.modal.result import mac_matrix
 
 FORMAT = "jaxbeam modes of logs 1"

@@ -3,10 +3,7 @@
 from tuning.weighing.accuracy import Accuracy, accuracy_class, relative_errors
 from tuning.weighing.axles import AxleWeighing, weigh_axles
 from tuning.weighing.calibration import calibrate_influence_lines
-from tuning.weighing.influence_lines import (
-    InfluenceLines,
-    model_influence_lines,
-)
+from tuning.weighing.influence_lines import InfluenceLines, model_influence_lines
 from tuning.weighing.traffic import (
     TrafficSettings,
     WeighedTraffic,

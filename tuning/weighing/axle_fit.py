@@ -110,6 +110,13 @@ def dynamic_waves(
     return table.reshape(times.size, -1, table.shape[3])
 
 
+def by_sensor(
+    table: Float[np.ndarray, "time column sensor"], weights: Float[np.ndarray, "time sensor"]
+) -> Float[np.ndarray, "row column"]:
+    """Weighted rows of a linear problem, sensor by sensor."""
+    return np.concatenate([table[:, :, s] * weights[:, s, None] for s in range(weights.shape[1])])
+
+
 def dynamic_errors(
     jacobian: Float[np.ndarray, "time parameter sensor"],
     waves: Float[np.ndarray, "time wave sensor"],
@@ -122,11 +129,7 @@ def dynamic_errors(
     `noise` is the standard deviation of white noise of each sensor; weights are zero for samples
     that do not count. The error of a parameter on which no reading depends is infinite.
     """
-
-    def stacked(table):
-        return np.concatenate([table[:, :, s] * weights[:, s, None] for s in range(len(noise))])
-
-    J, B = stacked(jacobian), stacked(waves)
+    J, B = by_sensor(jacobian, weights), by_sensor(waves, weights)
     r = (residuals * weights).T.ravel()
     white = (weights * noise).T.ravel()
     sizes = np.linalg.norm(J, axis=0)

@@ -31,11 +31,7 @@ from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import DYNAMIC_LIMITS, CrossingLog, dynamic_waves, white_noise
-from tuning.weighing.influence_lines import (
-    AxleGeometry,
-    InfluenceLines,
-    model_influence_lines,
-)
+from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, model_influence_lines
 
 KNOTS = 41  # of the smooth part
 FREQUENCY_RATIOS = np.geomspace(0.7, 1.8, 40)  # to the model's first frequency, that are tried

@@ -2,7 +2,7 @@
 
 Loads are added, singly and in pairs, where they explain most of the residual, and all are then
 refined together. The dynamic part of the response stays in the residual, but for velocities and
-accelerations (see `unit_force`).
+accelerations (see `influence_lines`).
 
 Moses' method: axle forces from influence lines, by linear least squares (Moses 1979).
 
@@ -27,9 +27,8 @@ from jaxbeam.case.loads.point import MovingMass
 from tuning.fit.least_squares import t_quantile
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.axle_fit import dynamic_errors, dynamic_waves, white_noise
-from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
-from tuning.weighing.unit_force import UnitForce
+from tuning.weighing.axle_fit import by_sensor, dynamic_errors, dynamic_waves, white_noise
+from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, UnitForce
 
 SPEED_COUNT = 16  # candidates in each direction,
 VIBRATING_SPEED_COUNT = 64  # if a sensor measures vibration, whose phase depends on the speed
@@ -238,11 +237,12 @@ def moses(
     axles, sensors = columns.shape[1:]
     if valid.sum() < axles + sensors + 2:
         raise ValueError(f"{axles} axles need more samples than {int(valid.sum())}")
+    shifts = np.broadcast_to(np.eye(sensors), (times.size, sensors, sensors))
     spread = np.where(valid, readings, np.nan)
     noise = np.maximum(np.nanstd(spread, axis=0), 1e-300)
     for _ in range(2):
         weights = valid / noise
-        rows = _with_offsets(columns, weights)
+        rows = by_sensor(np.concatenate([columns, shifts], axis=1), weights)
         sizes = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
         target = (readings * weights).T.ravel()
         solution = np.linalg.lstsq(rows / sizes, target, rcond=None)[0] / sizes
@@ -255,7 +255,6 @@ def moses(
     parts = [columns]
     if found:
         parts.append(_geometry_slopes(lines, geometry, times, solution[:axles]))
-    shifts = np.broadcast_to(np.eye(sensors), (times.size, sensors, sensors))
     jacobian = np.concatenate([*parts, shifts], axis=1)
     errors = dynamic_errors(jacobian, waves, residuals, white_noise(readings, valid), weights)
     covariance = errors.covariance[:axles, :axles]
@@ -277,14 +276,3 @@ def _geometry_slopes(lines, geometry: AxleGeometry, times, forces):
             readings.append(np.einsum("tas,a->ts", lines.at(at.positions(times)), forces))
         slopes.append((readings[0] - readings[1]) / (2 * step))
     return np.stack(slopes, axis=1)
-
-
-def _with_offsets(columns, weights):
-    """Rows (sensor by sensor) of the linear problem: axles, then the offsets of the sensors."""
-    axles, sensors = columns.shape[1:]
-    blocks = []
-    for s in range(sensors):
-        offsets = np.zeros((columns.shape[0], sensors))
-        offsets[:, s] = 1.0
-        blocks.append(np.hstack([columns[:, :, s], offsets]) * weights[:, s, None])
-    return np.vstack(blocks)

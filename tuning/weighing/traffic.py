@@ -30,10 +30,15 @@ from tuning.logs.pairing import sensor_readings
 from tuning.logs.reading import read_log, version_of
 from tuning.modal.preprocessing import with_channels
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
-from tuning.weighing.detectors import LEAST_GAP, axles_of_pulses, pulse_times
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, lines_for
 from tuning.weighing.search import with_free_frequency
-from tuning.weighing.vehicles import MOST_EXCESS, vehicles_in
+from tuning.weighing.vehicles import (
+    LEAST_GAP,
+    MOST_EXCESS,
+    axles_of_pulses,
+    pulse_times,
+    vehicles_in,
+)
 
 FORMAT = "jaxbeam vehicles 1"
 LEAST_WEIGHT = 35e3  # N, of vehicles that are weighed: lorries, by the usual limit of 3.5 t

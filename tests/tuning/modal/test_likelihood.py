@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from tests.tuning.modal.test_leaving import mode
 from tests.tuning.modal.test_modal import ambient
 from tuning import ModalSettings, identify_modes
-from tuning.modal.arguments import chosen_modes
+from tuning.modal.identify_modes import chosen_modes
 from tuning.modal.likelihood import (
     SpectralModel,
     Start,

@@ -19,8 +19,16 @@ from tuning.modal.harmonics import (
     without_lines,
 )
 from tuning.modal.result import IdentifiedMode, mac_matrix, normalised, phase_collinearity
-from tuning.modal.stabilisation import MIN_CHAIN_ORDERS, Chain
-from tuning.modal.subspace import Poles, Spread, block_rows, decompose, poles_of_order, spreads
+from tuning.modal.subspace import (
+    MIN_CHAIN_ORDERS,
+    Chain,
+    Poles,
+    Spread,
+    block_rows,
+    decompose,
+    poles_of_order,
+    spreads,
+)
 
 
 def free_response(times):
@@ -48,7 +56,7 @@ def test_first_order_uncertainty_agrees_with_differences():
     random = np.random.default_rng(0)
     values, _, _ = free_response(np.arange(2000) / 20)
     values = values + 1e-3 * random.normal(size=values.shape)
-    subspace = decompose((values[:1000], values[1000:]), 20.0, 12, as_blocks=True)
+    subspace = decompose((values[:1000], values[1000:]), 20.0, 12)
     pole = poles_of_order(subspace, 4).poles[:1]
     (own,) = spreads(subspace, 4, pole)
     matrix = (subspace.left[:, : subspace.values.size] * subspace.values) @ subspace.right.T

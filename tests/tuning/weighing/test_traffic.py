@@ -21,9 +21,9 @@ from tuning.weighing import (
     weigh_logs,
     weigh_vehicles,
 )
-from tuning.weighing.detectors import axles_of_pulses, pulse_times
 from tuning.weighing.influence_lines import AxleGeometry
 from tuning.weighing.traffic import is_beside
+from tuning.weighing.vehicles import axles_of_pulses, pulse_times
 
 BRIDGE = planted_trucks.BRIDGES[0]
 STEP, SEED, DETECTORS = planted_trucks.STEP * planted_trucks.EVERY, 31, {"d0": 4.0, "d1": 16.0}

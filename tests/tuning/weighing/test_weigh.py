@@ -18,8 +18,8 @@ from tests.oracles.planted_trucks import (
 from tests.tuning.fit.test_identify import deviations, log_of as weighed_log_of, one_span
 from tuning import Log, identify, weigh
 from tuning.weighing import calibrate_influence_lines, weigh_axles
+from tuning.weighing.influence_lines import UnitForce
 from tuning.weighing.matching_pursuit import MatchingPursuit
-from tuning.weighing.unit_force import UnitForce
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 TIMES = np.arange(301) / 250

@@ -23,13 +23,7 @@ from tuning.logs.readers.headings import (
     table_of_rows,
     unnamed,
 )
-from tuning.logs.readers.table import (
-    CHECKED_ROWS,
-    LogFormat,
-    LogTable,
-    check_last_line,
-    read_text,
-)
+from tuning.logs.readers.table import CHECKED_ROWS, LogFormat, LogTable, check_last_line, read_text
 
 RECORD_NUMBER = "RN"  # the unit that Campbell loggers give it
 _COMMENTS = ("#", "%", "//")

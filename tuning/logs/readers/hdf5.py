@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.files.endings import import_extra
-from tuning.logs.clocks import STARTS, clocks_by_numbers
 from tuning.logs.readers.headings import epoch_seconds, is_stamp
 from tuning.logs.readers.table import (
+    STARTS,
     LogFormat,
     LogTable,
+    clocks_by_numbers,
     damaged_file_error,
     table_of,
     text_attribute,
@@ -47,7 +48,8 @@ def read_hdf5(path: Path) -> dict[str, LogTable]:
                 if item.size < 2:
                     return
                 groups.setdefault(group, {})[label] = _numbers(item)
-                units.setdefault(group, {})[label] = _unit(item)
+                unit = text_attribute(item.attrs.get("units", item.attrs.get("unit")))
+                units.setdefault(group, {})[label] = unit
                 own = given.setdefault(group, {})
                 own[""] = whole | _numbers_of(item.parent.attrs) | own.get("", {})
                 own[label] = _numbers_of(item.attrs)
@@ -88,10 +90,6 @@ def _numbers(dataset) -> np.ndarray:
     values = values * own.get("scale_factor", 1.0) + own.get("add_offset", 0.0)
     # MATLAB stores vectors as matrices of one column.
     return np.ravel(values) if 1 in values.shape and values.ndim == 2 else values
-
-
-def _unit(dataset) -> str | None:
-    return text_attribute(dataset.attrs.get("units", dataset.attrs.get("unit")))
 
 
 FORMAT = LogFormat("HDF5", read_hdf5, suffixes=(".h5", ".hdf5"), magics=(MAGIC, MATLAB_MAGIC))

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.io import loadmat, matlab
 
 from jaxbeam.runtime.input_file import max_bytes
-from tuning.logs.clocks import clocks_by_numbers
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
+    clocks_by_numbers,
     damaged_file_error,
     read_bytes,
     table_of,

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.files.endings import import_extra
-from tuning.logs.clocks import Clock
 from tuning.logs.readers.table import (
+    Clock,
     LogFormat,
     LogTable,
     damaged_file_error,

@@ -8,8 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.files.endings import import_extra
-from tuning.logs.clocks import Clock
-from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, read_bytes, table_of
+from tuning.logs.readers.table import (
+    Clock,
+    LogFormat,
+    LogTable,
+    damaged_file_error,
+    read_bytes,
+    table_of,
+)
 
 
 def read_mseed(path: Path) -> dict[str, LogTable]:

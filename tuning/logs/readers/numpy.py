@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.clocks import clocks_by_numbers
 from tuning.logs.readers.headings import unnamed
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
+    clocks_by_numbers,
     damaged_file_error,
     read_bytes,
     table_of,

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.files.endings import import_extra
-from tuning.logs.clocks import Clock, clocks_of
 from tuning.logs.readers.table import (
+    Clock,
     LogFormat,
     LogTable,
+    clocks_of,
     damaged_file_error,
     date_of,
     is_time_name,
@@ -46,7 +47,8 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
             }
     except Exception as error:  # npTDMS raises many types for damaged files
         raise damaged_file_error(path, error) from None
-    broken = ["the recording breaks off within a segment"] if _is_truncated(file) else []
+    truncated = file.file_status.incomplete_final_segment
+    broken = ["the recording breaks off within a segment"] if truncated else []
     runs = {}
     for name, channels in groups.items():
         numeric = {a: b for a, b in samples[name].items() if np.issubdtype(b.dtype, np.number)}
@@ -82,10 +84,6 @@ def _silenced(nptdms):
 
 def _channels(group):
     return {channel.name: channel for channel in group.channels()}
-
-
-def _is_truncated(file) -> bool:
-    return bool(file.file_status.incomplete_final_segment)
 
 
 def _clocks(channels, units) -> tuple[dict[str, Clock] | None, float]:

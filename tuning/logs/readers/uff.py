@@ -15,8 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.files.endings import import_extra
-from tuning.logs.clocks import Clock, join_channels
-from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, read_bytes
+from tuning.logs.readers.table import (
+    Clock,
+    LogFormat,
+    LogTable,
+    damaged_file_error,
+    join_channels,
+    read_bytes,
+)
 
 MAGIC = b"    -1\n"
 MAGICS = (MAGIC, MAGIC.replace(b"\n", b"\r\n"), MAGIC.replace(b"\n", b" "))

@@ -21,10 +21,7 @@ from tuning.modal.decay.fit import (
     share_of_modes,
 )
 from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import (
-    PARTS,
-    without_excitation,
-)
+from tuning.modal.decay.leaving import PARTS, without_excitation
 from tuning.modal.decay.stretches import (
     Stretch,
     after_impact,
@@ -45,7 +42,7 @@ from tuning.modal.preprocessing import (
     strongest_frequency,
 )
 from tuning.modal.result import is_at_edge
-from tuning.modal.stabilisation import Diagram
+from tuning.modal.subspace import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # fraction of the energy that the modes of a free decay do not explain
 MIN_ENERGY_OF_MODES = 0.5  # of the energy at the beginning of decays

@@ -83,10 +83,9 @@ def band_spectrum(
 
 def find_poles(
     spectrum: Spectrum,
-    max_modes: int = MAX_MODES,
     start: Complex[np.ndarray, " start"] | None = None,
 ) -> PoleFit:
-    """Poles, `max_modes` at most, of the modes that are significant in a free decay's spectrum.
+    """Poles, MAX_MODES at most, of the modes that are significant in a free decay's spectrum.
 
     `start` are poles (1/s) to begin with; those in the band are refined, and kept if significant.
     """
@@ -99,6 +98,7 @@ def find_poles(
     misfit_level = _misfit_level(spectrum)
     nuisance = _nuisance_columns(spectrum).shape[1]
     most = max(2 * spectrum.bins.size - nuisance, 0) // 3  # a third of the numbers are left over
+    max_modes = MAX_MODES
     if start is not None and start.size:
         frequencies = start.imag / (2 * np.pi)
         inside = (frequencies > spectrum.bins[0]) & (frequencies < spectrum.bins[-1])

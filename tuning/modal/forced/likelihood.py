@@ -43,13 +43,6 @@ def line_means(
     )
 
 
-def error_spread(
-    errors: Float[np.ndarray, "row output"], reach: int
-) -> Float[np.ndarray, "line output"]:
-    """Root mean square of errors over `reach` lines on either side of each."""
-    return np.sqrt(line_means(errors**2, reach))
-
-
 def free_errors(
     errors: Float[np.ndarray, "row output"],
     columns: Float[np.ndarray, "row column"],
@@ -401,8 +394,8 @@ def triangular_factor(
 def whitened(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> Lines:
     """Lines multiplied by a level that makes their errors those of white noise."""
     fit = linear_fit(lines, poles)
-    spread = error_spread(fit.errors, WIDE)
-    spread = np.sqrt(np.mean(spread**2 / np.maximum(np.mean(spread**2, axis=0), 1e-300), axis=1))
+    power = line_means(fit.errors**2, WIDE)
+    spread = np.sqrt(np.mean(power / np.maximum(np.mean(power, axis=0), 1e-300), axis=1))
     level = 1 / np.maximum(spread, MIN_SPREAD)
     return lines._replace(
         outputs=lines.outputs * level[:, None], inputs=lines.inputs * level[:, None], level=level

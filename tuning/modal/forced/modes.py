@@ -17,13 +17,7 @@ from jaxtyping import Complex, Float
 from scipy.signal import detrend
 from scipy.stats import f as fisher, t as student
 
-from tuning.modal.ambient import (
-    MAX_ORDER,
-    Candidate,
-    divided_band,
-    overlapping,
-    without_duplicates,
-)
+from tuning.modal.ambient import MAX_ORDER, Candidate, divided_band, overlapping, without_duplicates
 from tuning.modal.forced.likelihood import (
     BLOCKS,
     NEIGHBOURS,
@@ -53,8 +47,7 @@ from tuning.modal.result import (
     frequency_and_damping,
     rejection_reason,
 )
-from tuning.modal.stabilisation import Diagram, stabilise
-from tuning.modal.subspace import Poles
+from tuning.modal.subspace import Diagram, Poles, stabilise
 
 DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
 NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates
