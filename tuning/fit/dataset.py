@@ -13,6 +13,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.time_grid import EventSchedule, stack_schedules
 from jaxbeam.model.elements import largest_layout
+from jaxbeam.model.plausibility.check import check
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log
@@ -45,16 +46,24 @@ class Dataset:
         return LogPrediction(self.cases, self.times, self.plan, self.schedule, addresses)
 
     def validity_warning(self, values: dict[str, float]) -> str:
-        """Warning that the integration plan does not hold at the fitted values; "" if it does.
+        """Warning that the fitted values are implausible, where the starts are not, or that the
+        integration plan does not hold at them; "" without.
 
-        The plan was made for the starts: far from them the loads may change their order, or
-        steps be too long; and without bounds a parameter may end at a value that no beam can have.
+        Without bounds a parameter may end at a value that no beam can have. The plan was made for
+        the starts: far from them the loads may change their order, or steps be too long.
         """
         for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
             try:
-                plan = integration_plan(
-                    with_values(case, i, values), jnp.asarray(times), SIMULATION_TOLERANCE
-                )
+                fitted = with_values(case, i, values)
+                about = {said.partition(":")[0] for said in check(case).warnings}
+                new = [s for s in check(fitted).warnings if s.partition(":")[0] not in about]
+                if new:
+                    return (
+                        f", but to values that can hardly be meant: {new[0]}; give bounds, as by"
+                        " --free ADDRESS=LOW:HIGH, or find some of them first by the modes of the"
+                        " vibration after the load"
+                    )
+                plan = integration_plan(fitted, jnp.asarray(times), SIMULATION_TOLERANCE)
             except (ValueError, RuntimeError) as error:
                 return f", to a case that cannot be simulated: {error}"
             layouts = plan.shapes.layout, self.plan.shapes.layout

@@ -188,6 +188,17 @@ def test_bounds_hold_and_are_reported_when_reached():
     assert fit.to_dict()["numbers"]["beam.flexural_rigidity"]["at_bound"]
 
 
+def test_implausible_ends_of_a_search_are_told():
+    """Nothing but noise: the search may end anywhere, as at 2.8 times critical damping."""
+    case = small()
+    dataset = make_dataset(case, [simulated_log(case)])
+    assert dataset.validity_warning({"beam.damping_ratio": 0.05}) == ""
+    said = dataset.validity_warning({"beam.damping_ratio": 2.8})
+    assert said.startswith(", but to values that can hardly be meant: beam.damping_ratio: the")
+    already = make_dataset(replace(case, {"beam.damping_ratio": 0.4}), [simulated_log(case)])
+    assert already.validity_warning({"beam.damping_ratio": 0.41}) == ""
+
+
 def test_stiffness_of_an_elastic_support():
     """From a log simulated by jaxbeam; finite elements are used in test_recovery."""
     case = dataclasses.replace(
