@@ -27,6 +27,7 @@ from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.runtime.progress import ProgressBar
 from tuning.logs.log import Log, LogWarning
 from tuning.logs.pairing import sensor_readings
+from tuning.logs.readers.headings import epoch_seconds
 from tuning.logs.reading import read_log, version_of
 from tuning.modal.preprocessing import with_channels
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
@@ -329,7 +330,8 @@ def weigh_logs(
     See `weigh_vehicles`, also for `influence_lines`. A line is added to the store, a text file,
     after each vehicle; logs that have changed, or whose descriptions have, are weighed again.
     `columns`, `rate` (Hz) and `missing` are those of `tuning.read_log`; a bar shows `progress`.
-    Logs that cannot be read are among the problems.
+    Logs that cannot be read, and copies of others, are among the problems. Vehicles are in the
+    order of their dates, or else of the logs.
 
     Raises FileNotFoundError without the folder of the store, ValueError for a store of another
     case, lines, settings or reading, if no log can be read, and as `weigh_vehicles` does.
@@ -379,13 +381,20 @@ def weigh_logs(
     if problems and len(problems) == len(paths):
         several = f"; none of the {len(paths)} logs can be weighed" * (len(paths) > 1)
         raise ValueError(problems[0] + several)
-    parts = [
-        stored.found[f"{name} {number}"]
-        for name in names
-        for number in range(stored.whole.get(name, 0))
-    ]
+    parts, first_of = [], {}
+    for name, path in zip(names, paths, strict=True):
+        own = [stored.found[f"{name} {number}"] for number in range(stored.whole.get(name, 0))]
+        rows = [one[1:] for vehicles, _ in own for one in vehicles]  # without the name of the log
+        first = first_of.setdefault(repr(rows), path) if rows else path
+        if first is path:
+            parts += own
+        else:
+            problems.append(f"{path} is a copy of {first}: its vehicles count once")
     found = _traffic(parts)
-    return dataclasses.replace(found, problems=(*found.problems, *problems, *remarks))
+    vehicles, dates = found.vehicles, [epoch_seconds(one.stamp) for one in found.vehicles]
+    if all(dates):
+        vehicles = tuple(vehicles[i] for i in np.argsort(dates, kind="stable"))
+    return WeighedTraffic(vehicles, (*found.problems, *problems, *remarks))
 
 
 SYMMETRY = 0.01  # of a line's largest value, by which it differs from its mirror image

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import datetime
 import json
 
 import numpy as np
@@ -257,6 +258,23 @@ def test_logs_of_other_descriptions_are_weighed_again(tmp_path, monkeypatch):
     found = weighed("one.csv", "other.csv")
     assert found.vehicles == () and "no vehicle explains" in found.problems[0]
     assert "other.csv" in found.problems[1]
+
+
+def test_copies_count_once_and_vehicles_are_in_the_order_of_dates(tmp_path):
+    lines, log = crossed(5e-7)
+    for name, day in (("a.csv", 2), ("b.csv", 1), ("c.csv", 2)):
+        begin = datetime.datetime(2026, 10, day)
+        stamps = [(begin + datetime.timedelta(seconds=t)).isoformat() for t in log.times.tolist()]
+        rows = (
+            f"{stamp},{s0:.9g},{s1:.9g}"
+            for stamp, (s0, s1) in zip(stamps, log.values.tolist(), strict=True)
+        )
+        (tmp_path / name).write_text("\n".join(["time,s0 [1],s1 [1]", *rows]))
+    paths = [tmp_path / name for name in ("a.csv", "b.csv", "c.csv")]
+    settings = TrafficSettings(SPEEDS)
+    found = weigh_logs(case_of(BRIDGE), paths, tmp_path / "store.jsonl", settings, lines)
+    assert [one.file for one in found.vehicles] == ["b.csv", "a.csv"]
+    assert found.problems == (f"{paths[2]} is a copy of {paths[0]}: its vehicles count once",)
 
 
 def write(path, log: Log, rows=slice(None)):
