@@ -274,6 +274,41 @@ def passings(
     return found
 
 
+ONE_SIGNED = 0.5  # of the area of a line's values without signs, that its area is at least
+AT_ENDS = 0.3  # s at the start and end of a passing, between which its level is a straight line
+
+
+def turned_sensors(
+    lines: InfluenceLines,
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+    found: Sequence[Passing],
+) -> list[int]:
+    """Sensors that read with the sign opposite to their influence lines in most passings `found`.
+
+    The integral of a reading over a passing is the weight times the area of the line over the
+    speed, where the line has mostly one sign.
+
+    >>> import numpy as np
+    >>> lines = InfluenceLines(np.array([0.0, 5, 10]), np.array([[0.0], [-1e-8], [0]]))
+    >>> times = np.arange(400) / 100
+    >>> readings = -5e4 * lines.at(20 * (times - 1.0))
+    >>> turned_sensors(lines, times, readings, [Passing(0.5, 3.5)])
+    [0]
+    """
+    areas, sizes = lines.values.sum(axis=0), np.abs(lines.values).sum(axis=0)
+    votes = np.zeros(areas.size)
+    for one in found:
+        own = readings[(times >= one.start) & (times <= one.end)]
+        few = max(round(AT_ENDS / float(np.median(np.diff(times)))), 1)
+        if one.problem or len(own) < 2 * few:
+            continue
+        level = np.linspace(own[:few].mean(axis=0), own[-few:].mean(axis=0), len(own))
+        votes += np.sign((own - level).sum(axis=0))
+    told = np.abs(areas) > ONE_SIGNED * sizes
+    return np.flatnonzero(told & (votes * np.sign(areas) < 0)).tolist()
+
+
 @refuses_traced("a weighing")
 def weigh_vehicles(
     case: Case,
@@ -451,6 +486,21 @@ class _Record(NamedTuple):
         )  # fmt: skip
 
     def weighed(self, passing: Passing) -> tuple[list[WeighedVehicle], list[str]]:
+        """Vehicles of a part of the log, and sentences on why it was not weighed.
+
+        With the first part, sentences on sensors that read with the wrong sign.
+        """
+        vehicles, said = self._weighed(passing)
+        turned = []
+        if passing is self.passings[0]:
+            turned = turned_sensors(self.lines, self.times, self.readings, self.passings)
+        return vehicles, said + [
+            f"{self.name}: sensors.{i} reads with the sign opposite to its influence line, and"
+            " weights are wrong: turn its channel, or calibrate again"
+            for i in turned
+        ]
+
+    def _weighed(self, passing: Passing) -> tuple[list[WeighedVehicle], list[str]]:
         """Vehicles of a part of the log, and sentences on why it was not weighed."""
         when = self._stamp(passing.start) or f"{passing.start:.2f} s"
         about = f"{self.name}, {when}: "

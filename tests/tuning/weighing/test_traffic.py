@@ -260,6 +260,20 @@ def test_logs_of_other_descriptions_are_weighed_again(tmp_path, monkeypatch):
     assert "other.csv" in found.problems[1]
 
 
+def test_sensors_of_the_wrong_sign_are_named(monkeypatch):
+    """The weight times the line's area over the speed is the integral of a reading."""
+    lines, log = crossed(5e-7)
+    monkeypatch.setattr("tuning.weighing.traffic.vehicles_in", lambda *_: [])
+    for signs, turned in (([1, 1], []), ([1, -1], [1]), ([-1, -1], [0, 1])):
+        drift = 1e-6 * log.times[:, None]
+        other = dataclasses.replace(log, values=log.values * signs + drift)
+        found = weigh_vehicles(case_of(BRIDGE), other, TrafficSettings(SPEEDS), lines).problems
+        said = [one for one in found if "with the sign opposite to its influence line" in one]
+        assert [f"sensors.{i} reads" in one for i, one in zip(turned, said, strict=True)] == [
+            True
+        ] * len(turned)
+
+
 def test_copies_count_once_and_vehicles_are_in_the_order_of_dates(tmp_path):
     lines, log = crossed(5e-7)
     for name, day in (("a.csv", 2), ("b.csv", 1), ("c.csv", 2)):
