@@ -14,6 +14,8 @@ from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.logs.readers.headings import epoch_seconds
 from tuning.monitoring.chart import ControlChart, chart_of
 from tuning.monitoring.history import (
+    MAX_STEP,
+    REMEMBERED,
     AnalysisSettings,
     ModeHistory,
     ModeTrack,
@@ -143,13 +145,17 @@ class Monitoring(TableViews):
         if chart is None:
             return []
         silent = [
-            entries[i]
+            i
             for i in range(self.baseline, len(entries))
             if entries[i].frequencies.size and np.isnan(chart.statistic[i])
         ]
-        why = f", {' or '.join(chart.conditions)} being unknown or far from all others"
-        said = f"{len(silent)} logs after the baseline, as {{}}, tell nothing"
-        return [said.format(silent[0].file) + why * bool(chart.conditions)] if silent else []
+        if not silent:
+            return []
+        known = [np.isfinite(self.tracks[i].frequencies[silent]).any() for i in chart.used]
+        why = f"{' or '.join(chart.conditions)} being unknown or far from all others"
+        why = why if any(known) else "without the modes of the baseline"
+        first = entries[silent[0]].file
+        return [f"{len(silent)} logs after the baseline, as {first}, tell nothing, {why}"]
 
     @property
     def come_and_gone(self) -> list[str]:
@@ -161,6 +167,9 @@ class Monitoring(TableViews):
                 found.append(f"{_frequency(track):.4g} Hz is not found after {files[track.last]}")
             if track.born >= self.baseline:
                 found.append(f"{_frequency(track):.4g} Hz is found since {files[track.born]} only")
+        new = [track for track in self.tracks if track.born >= self.baseline]
+        if new and all(any(_goes_on(one, track) for one in self.tracks) for track in new):
+            found[-1] += " (shapes have changed, not frequencies: has a sensor been turned?)"
         return [f"ALARM: {', '.join(found)}"] if found else []
 
     @property
@@ -238,6 +247,14 @@ class Monitoring(TableViews):
 
 def _frequency(track: ModeTrack) -> float:
     return float(np.nanmedian(track.frequencies))
+
+
+def _goes_on(before: ModeTrack, after: ModeTrack) -> bool:
+    """Whether a track ends where another begins, at a frequency that it could have gone on to."""
+    last = before.frequencies[np.isfinite(before.frequencies)][-REMEMBERED:]
+    first = after.frequencies[np.isfinite(after.frequencies)][:REMEMBERED]
+    step = abs(float(np.log(np.median(first) / np.median(last))))
+    return before.last < after.born and step <= float(np.log1p(MAX_STEP))
 
 
 def monitor(

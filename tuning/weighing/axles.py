@@ -124,8 +124,8 @@ class AxleWeighing:
         if fit.excess > MOST_EXCESS:
             lines.append(
                 f"residuals have {fit.excess:.3g} times the variance that noise and dynamic wheel"
-                " forces give them: number of axles, range of speeds or influence lines are wrong,"
-                " and intervals too narrow; calibrate by more runs"
+                " forces give them: number of axles, range of speeds, signs of sensors or influence"
+                " lines are wrong, and intervals too narrow; calibrate by more runs"
             )
         if self.bic:
             lines.append(
@@ -195,7 +195,8 @@ def weigh_axles(
     fits, tried = find_axles(lines, crossing, speeds, both_ways, axles)
     if not fits:
         raise ValueError(
-            f"{log.source}: no load is found in it at {low:g} to {high:g} m/s: other speeds?"
+            f"{log.source}: no load is found in it at {low:g} to {high:g} m/s: other speeds,"
+            " or sensors of the opposite sign?"
         )
     criteria = dict(sorted(tried.items())) if axles is None else {}
     fit = fits[axles] if axles else most_likely(fits)

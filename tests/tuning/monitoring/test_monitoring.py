@@ -151,6 +151,19 @@ def test_channels_are_known_by_their_names(kind):
         assert_allclose(one.frequencies, other.frequencies)
 
 
+def test_a_sensor_that_is_turned_is_told_from_a_change_of_the_structure():
+    """Shapes change, frequencies do not; a loss of a fifth of the rigidity is no such case."""
+    turned = [
+        one if i < 120 else one._replace(shapes=one.shapes * [1, 1, -1])
+        for i, one in enumerate(history(4).entries)
+    ]
+    said = "(shapes have changed, not frequencies: has a sensor been turned?)"
+    assert said in monitored(ModeHistory(tuple(turned), {}), baseline=100).verdict
+    lost = monitored(history(4, loss=0.2), baseline=100).verdict
+    assert "ALARM" in lost and said not in lost
+    assert "50 logs after the baseline, as 150.csv, tell nothing, without the modes of" in lost
+
+
 def test_logs_without_the_temperature_are_told():
     """The logger of temperatures fails after the baseline; the chart would be silent for ever."""
     planted = history(5, loss=0.05)
