@@ -26,6 +26,7 @@ from tests.tuning.finite_element_rigs import (
     plant,
 )
 from tuning import Fit, Log, identify
+from tuning.fit.dataset import make_dataset
 from tuning.parameters import to_unbounded
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
