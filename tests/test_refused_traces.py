@@ -233,3 +233,17 @@ def test_extremes_at_supports_and_loads_move_with_them(address):
     slopes, step = jax.jvp(extremes, (value,), (1.0,))[1], 1e-4 * value
     differences = (extremes(value + step) - extremes(value - step)) / (2 * step)
     np.testing.assert_allclose(slopes, differences, rtol=3e-3)
+    # Of a place that did not move, as what `vmap` wraps was taken for unknown.
+    np.testing.assert_allclose(jax.jacfwd(extremes)(value), slopes, rtol=1e-9)
+
+
+def test_extremes_at_a_support_on_the_grid_move_with_it_under_jit():
+    """Half of the slope was that at the point of the grid, which does not move."""
+    case = dataclasses.replace(CASE, actuators=(), supports=(jb.Support(0.36),))
+    simulator = jb.Simulator(case, {"supports.0.position": (0.34, 0.38)})
+
+    def smallest(place):
+        return simulator([place]).envelope("moment").smallest.min()
+
+    differences = (smallest(0.3601) - smallest(0.3599)) / 2e-4
+    np.testing.assert_allclose(jax.jit(jax.grad(smallest))(0.36), differences, rtol=3e-3)

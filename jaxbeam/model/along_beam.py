@@ -19,7 +19,7 @@ from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.elements import NODE_TOLERANCE, actuator_terms, node_positions
 from jaxbeam.model.load_set import load_set
-from jaxbeam.runtime.arrays import Array, any_traced, set_at, xp
+from jaxbeam.runtime.arrays import Array, any_traced, set_at, take, xp
 
 GRID = 101  # equally spaced positions
 LEFT_DISTANCE = 1e-7  # from a position to the section left of it, over the length
@@ -79,10 +79,14 @@ def positions_along(
 ) -> Float[Array, " position"]:
     """Ascending positions (m): `count` equally spaced ones, the special ones and concrete `places`.
 
-    Grid points within rounding of special positions are left out, where numbers are concrete.
+    Grid points within rounding of special positions are left out, where numbers are concrete, and
+    move with these otherwise.
     """
     special, grid = special_positions(case), case.beam.length * np.linspace(0.0, 1.0, count)
     if not is_concrete(special):
+        apart = xp.abs(grid[:, None] - special)
+        near = xp.min(apart, axis=1) <= NODE_TOLERANCE * case.beam.length
+        grid = xp.where(near, take(special, xp.argmin(apart, axis=1)), grid)
         return xp.sort(xp.concatenate([special, grid]))
     special = np.unique(np.concatenate([concrete(special), places]))
     grid = concrete(grid)

@@ -238,7 +238,8 @@ def _by_slopes(equations: "_Equations", constants, name: str, order: int, number
 
     @values.defjvp
     def _(primals, tangents):
-        *found, slopes = _by_slopes(equations, constants, name, order + 1, *primals)
+        outputs = _by_slopes(equations, constants, name, order + 1, *primals)
+        *found, slopes = map(_without_batch, outputs)
         leaves, structure = jax.tree.flatten(found)
         along = iter(_along(slopes, *tangents))
         none = (np.zeros(leaf.shape, jax.dtypes.float0) for leaf in leaves)
@@ -252,6 +253,13 @@ def _by_slopes(equations: "_Equations", constants, name: str, order: int, number
         return _program_of(equations, name, order, not inside)(constants, numbers)
 
     return values(numbers)
+
+
+def _without_batch(value):
+    """Value that a `vmap` of other numbers has wrapped, so that it is concrete under `jacfwd`."""
+    while hasattr(value, "batch_dim") and value.batch_dim is None:
+        value = value.val
+    return value
 
 
 @jax.jit
