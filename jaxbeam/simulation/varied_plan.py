@@ -7,7 +7,7 @@ steps depend little, and must be declared for all others.
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -67,6 +67,10 @@ def declared_ranges(case: Case, vary) -> dict[str, Range]:
     """
     if isinstance(vary, str):
         vary = (vary,)
+    if not isinstance(vary, Iterable) or not all(isinstance(one, str) for one in vary):
+        raise ValueError(
+            f"vary lists addresses, such as 'loads.0.mass', or maps each to its range, not {vary!r}"
+        )
     given = dict(vary) if isinstance(vary, Mapping) else dict.fromkeys(vary)
     ranges = {}
     for address, both in given.items():

@@ -172,6 +172,9 @@ def test_wrong_uses_of_a_simulator_are_said():
         jb.Simulator(CASE, {MASS: (2.0, 1.0)})
     with pytest.raises(ValueError, match=r"must be \(low, high\), not 0.3"):
         jb.Simulator(CASE, {MASS: 0.3})
+    for vary in (None, [3]):
+        with pytest.raises(ValueError, match=r"vary lists addresses, such as .*, not \[?(None|3)"):
+            jb.Simulator(CASE, vary)
     with pytest.raises(ValueError, match=r"as many values as numbers vary, 1 .*, not 2"):
         SIMULATOR([0.2, 0.3])
     with pytest.raises(ValueError, match="fixes the number of samples"):
