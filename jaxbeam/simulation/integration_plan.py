@@ -389,8 +389,9 @@ def run_schedule(
 def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> IntegrationPlan:
     """Plan for several cases that differ in numbers only: the largest number of loads and steps.
 
-    The error is the largest of all, the schedule that of the first. Raises ValueError, which names
-    the cases by `what`, if they differ in the order of positions along the beam.
+    The error is the largest of all that have one, as runs that diverge have none; the schedule is
+    that of the first. Raises ValueError, which names the cases by `what`, if they differ in the
+    order of positions along the beam.
     """
     first = plans[0]
     layout = largest_layout([plan.shapes.layout for plan in plans])
@@ -410,9 +411,9 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         substeps=max(plan.substeps for plan in plans),
         lead_samples=max(plan.lead_samples for plan in plans),
         equally_spaced=all(plan.equally_spaced for plan in plans),
-        error=max(plan.error for plan in plans),
+        error=float(np.fmax.reduce([plan.error for plan in plans])),
         of_peaks=all(plan.of_peaks for plan in plans),
-        sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
+        sensor_errors=tuple(np.fmax.reduce([plan.sensor_errors for plan in plans]).tolist()),
         origin=common_origin([plan.origin for plan in plans]),
     )
 

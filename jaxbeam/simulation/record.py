@@ -200,8 +200,8 @@ class Result(enum.IntFlag):
     """Flags of what is wrong with a run, combined in one number that programs can return.
 
     `CONTACT_LOST`: a contact force is tensile, at which the load would lift off. `STEPS_TOO_LONG`:
-    the error estimate is above the tolerance. `DIVERGED`: the closed loop has grown beyond all
-    bounds. `OUT_OF_RANGE`: a number is outside of the range for which the steps were chosen.
+    the error estimate is above the tolerance, or NaN. `DIVERGED`: the closed loop has grown beyond
+    all bounds. `OUT_OF_RANGE`: a number is outside of the range for which the steps were chosen.
 
     >>> import jaxbeam as jb
     >>> print(jb.Result.DIVERGED in jb.Result(5), jb.Result.OUT_OF_RANGE in jb.Result(5))

@@ -279,10 +279,11 @@ def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
     # As arrays: of single numbers each value would have a program of its own.
     of_steps = record.error_estimate + errors[:1]
     lost = xp.isfinite(record.contact_lost_time) & ~record.loads.prescribed
+    diverged = xp.any(xp.isnan(record.coordinates))
     flags = {
         Result.CONTACT_LOST: xp.any(lost) & (record.flights is None),
-        Result.STEPS_TOO_LONG: xp.any(of_steps > tolerance),
-        Result.DIVERGED: xp.any(xp.isnan(record.coordinates)),
+        Result.STEPS_TOO_LONG: ~xp.any(of_steps <= tolerance) & ~diverged,  # or NaN: none is known
+        Result.DIVERGED: diverged,
         Result.OUT_OF_RANGE: xp.logical_not(inside),
     }
     return dataclasses.replace(

@@ -1,5 +1,7 @@
 """Runs inside of transformations: prepared once, or as they come, without a plan."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -124,6 +126,18 @@ def test_a_run_that_is_not_finite_has_no_peaks_in_a_batch():
     assert_allclose(peaks, [peak_of(0.2), np.nan], rtol=1e-6)
     assert np.array_equal(np.isnan(forces), [False, True])
     assert jb.Result.DIVERGED in jb.Result(int(results[1]))
+
+
+def test_ends_of_a_range_that_diverge_take_no_error_estimate_from_other_runs():
+    """All runs had NaN, and a result of 0, as the loop of the middle of the range diverges."""
+    law = jb.Feedback([900.0], period=0.005)
+    case = dataclasses.replace(CASE, actuators=(jb.PointForce(0.3),), controller=law)
+    record = jb.Simulator(case, {"controller.gains.0": (100.0, 2e6)})([900.0])
+    exact = jb.simulate(case, tolerance=1e-10).peak_deflection
+    error = np.max(np.abs(record.peak_deflection / exact - 1))
+    assert error <= record.error_estimate < 1e-6 and record.result == 0
+    record = jb.Simulator(case, {"controller.gains.0": (1e6, 2e6)})([1e6])
+    assert record.result == jb.Result.DIVERGED and np.isnan(record.error_estimate)
 
 
 def test_single_precision_is_refused():
