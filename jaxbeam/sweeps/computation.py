@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from jaxbeam.case.case import Case, address_words, concrete_case, replace, structure_of, unit_at
 from jaxbeam.case.fields import concrete
@@ -35,7 +35,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, modal_influence_line
-from jaxbeam.runtime.arrays import Array, collapse
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.memory import remembered, size_text
 from jaxbeam.runtime.printer import labelled_dataset
 from jaxbeam.runtime.progress import ProgressBar
@@ -44,7 +44,7 @@ from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.section_forces import motion_at, motion_of_forces
 from jaxbeam.simulation.views import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
-from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches
+from jaxbeam.sweeps.batches import PROFILE_NUMBER
 from jaxbeam.sweeps.specification import AnyRunner, SweepSpecification, is_corrected
 from jaxbeam.sweeps.store import BlockStore, MemoryStore
 
@@ -278,7 +278,8 @@ def compute_sweep(
     if client is not None:
         for block in cluster.compute_blocks(client, fingerprint, path, missing[1:]):
             progress_bar.update(runner.run_count(block))
-    dataset = _to_dataset(specification, runner.batches, block_store.collect(runner.block_count))
+    flat = block_store.collect(runner.block_count, runner.batches.run_index)
+    dataset = _to_dataset(specification, flat)
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
     if estimates:
         worst = worst_runs(specification, dataset)
@@ -353,17 +354,10 @@ def _compute(runner: AnyRunner, blocks: list[int], steps, block_store: BlockStor
 
 
 def _to_dataset(
-    specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
+    specification: SweepSpecification, flat: dict[str, Shaped[np.ndarray, "run ..."]]
 ) -> "xarray.Dataset":
-    """Dataset of the results of all batches, with a dimension for each address, or `run`."""
+    """Dataset of the results of all runs, with a dimension for each address, or `run`."""
     case, dims, shape = specification.case, specification.dims, specification.shape
-    index = batches.run_index.reshape(-1)
-    rows = np.empty(specification.count, int)
-    rows[index[index >= 0]] = np.flatnonzero(index >= 0)
-    flat = {
-        name: collapse(values, 0, 2)[rows]  # padding is at the end, or left out
-        for name, values in results.items()
-    }
     failed = ~np.all(np.isfinite(flat["peak_deflection"]), axis=1)
     if case.absorbers:  # which hold on to the beam
         of_wheels = [name for name in flat if SWEEP_VARIABLES[name][0] == ("load",)]

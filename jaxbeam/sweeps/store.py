@@ -28,9 +28,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Int, Shaped
 
 from jaxbeam.files.netcdf import check_codecs
-from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.output_file import naming_file, writer_lock
 from jaxbeam.runtime.printer import labelled_dataset
 
@@ -51,8 +51,35 @@ class BlockStore(abc.ABC):
         """Store the results of a block by name; their shapes are the same for all blocks."""
 
     @abc.abstractmethod
-    def collect(self, blocks: int) -> dict[str, np.ndarray]:
-        """Results of so many blocks by name, concatenated along the first axis."""
+    def intact(self, blocks: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Numbers and results of the stored ones of so many blocks."""
+
+    @abc.abstractmethod
+    def empty(self, name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """Array for the results of all runs, in memory or in a file that is mapped to memory."""
+
+    def collect(
+        self, blocks: int, index: Int[np.ndarray, "path batch"]
+    ) -> dict[str, Shaped[np.ndarray, "run ..."]]:
+        """Results of so many blocks by name; `index` is the number of each run, -1 without one.
+
+        Blocks (path, batch, ...) have as many paths each; those beyond the end of the last are left
+        out. Raises ValueError if a block is not stored, or damaged.
+        """
+        collected: dict[str, np.ndarray] = {}
+        found = set()
+        for block, results in self.intact(blocks):
+            for name, values in results.items():
+                if name not in collected:
+                    shape = (int(index.max()) + 1, *values.shape[2:])
+                    collected[name] = self.empty(name, shape, values.dtype)
+                own = index[block * len(values) : (block + 1) * len(values)]
+                is_run = own >= 0
+                collected[name][own[is_run]] = values[: len(own)][is_run]
+            found.add(block)
+        if len(found) < blocks:
+            raise ValueError("finished blocks cannot be read")
+        return collected
 
     @abc.abstractmethod
     def finish(self, dataset: xarray.Dataset) -> None:
@@ -71,9 +98,11 @@ class MemoryStore(BlockStore):
     def write(self, block, results):
         self._blocks[block] = results
 
-    def collect(self, blocks):
-        parts = [self._blocks[block] for block in range(blocks)]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    def intact(self, blocks):
+        return ((block, self._blocks[block]) for block in range(blocks))
+
+    def empty(self, name, shape, dtype):
+        return np.empty(shape, dtype)
 
     def finish(self, dataset):
         pass
@@ -82,6 +111,7 @@ class MemoryStore(BlockStore):
 FINGERPRINT_ATTRIBUTE = "jaxbeam_sweep"
 BLOCKS_GROUP = "blocks"
 BLOCK_FILES = ".blocks"  # ending of the files of blocks
+ROWS_FILE = ".rows"  # ending of the files in which results are collected
 DAMAGE_ERRORS = (
     OSError,
     ValueError,
@@ -160,6 +190,11 @@ def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
             temporary_path.rename(path)
     finally:
         shutil.rmtree(temporary_path, ignore_errors=True)
+
+
+def file_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """New array in a file, so that it may be larger than the memory."""
+    return np.memmap(path, dtype, "w+", shape=shape)
 
 
 def _of_any_length(values: np.ndarray) -> np.ndarray:
@@ -295,20 +330,15 @@ class ZarrStore(BlockStore):
                 self._own_file = self._new_file()
             append_block(self._own_file, block, results)
 
-    def collect(self, blocks: int) -> dict[str, np.ndarray]:
-        """Results of so many blocks. Raises ValueError if one is not stored, or damaged."""
-        collected: dict[str, np.ndarray] = {}
-        found = set()
+    def intact(self, blocks: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        return self._intact(range(blocks))
+
+    def empty(self, name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        return file_array(self._folder / f"{name}{ROWS_FILE}", shape, dtype)
+
+    def collect(self, blocks, index):
         with explaining_damage(self._path):
-            for block, results in self._intact(range(blocks)):
-                for name, values in results.items():
-                    if name not in collected:
-                        collected[name] = np.empty((blocks, *values.shape), values.dtype)
-                    collected[name][block] = values
-                found.add(block)
-            if len(found) < blocks:
-                raise ValueError("finished blocks cannot be read")
-        return {name: collapse(values, 0, 2) for name, values in collected.items()}
+            return super().collect(blocks, index)
 
     def finish(self, dataset: xarray.Dataset) -> None:
         replace_blocks(self._path, dataset)
@@ -330,7 +360,10 @@ class ZarrStore(BlockStore):
 
 
 def read_dataset(path: Path) -> xarray.Dataset:
-    """Dataset of a complete store. Raises ValueError if part of it is missing or damaged."""
+    """Dataset of a complete store, whose histories are read where they are used.
+
+    Raises ValueError if part of it is missing or damaged; damage of histories is found in reading.
+    """
     import xarray
     import zarr
 
@@ -344,7 +377,11 @@ def read_dataset(path: Path) -> xarray.Dataset:
         incomplete = [name for name, array in arrays.items() if not is_complete(array)]
         if incomplete:
             raise ValueError(f"parts of {', '.join(sorted(incomplete))} are missing")
-        return xarray.open_zarr(path, consolidated=False, zarr_format=3).load()
+        dataset = xarray.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+        for variable in dataset.variables.values():
+            if variable.dims == ("time",) or "time" not in variable.dims:
+                variable.load()
+        return dataset
 
 
 def status(path: Path) -> tuple[str, str] | None:

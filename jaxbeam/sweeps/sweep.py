@@ -81,10 +81,13 @@ class WordSweep:
         content = [self.words, self.dims, [part.fingerprint() for part in self.sweeps]]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
-    def join(self, datasets: "Sequence[xarray.Dataset]") -> "xarray.Dataset":
+    def join(
+        self, datasets: "Sequence[xarray.Dataset]", folder: Path | None = None
+    ) -> "xarray.Dataset":
         """Dataset with a dimension for each address, from those of all combinations of words.
 
-        `cases` along the words has their cases as text; the attribute `case` that of the sweep.
+        With a `folder` it is in files there, as histories may be larger than the memory. `cases`
+        along the words has their cases as text; the attribute `case` that of the sweep.
         """
         import xarray
 
@@ -93,8 +96,18 @@ class WordSweep:
         sizes = tuple(len(words) for words in self.words.values())
         variables = {}
         for name, first in datasets[0].data_vars.items():
-            values = np.stack([part[name].values for part in datasets])
-            values = values.reshape(*sizes, *values.shape[1:])
+            shape, dtype = (len(datasets), *first.shape), first.dtype
+            path = None if folder is None else folder / f"{name}{sweep_store.ROWS_FILE}"
+            values = (
+                np.empty(shape, dtype)
+                if path is None
+                else sweep_store.file_array(path, shape, dtype)
+            )
+            for own, part in zip(values, datasets, strict=True):
+                rows = part[name].encoding.get("chunks", first.shape)[0]  # that are read at once
+                for i in range(0, len(own), rows):
+                    own[i : i + rows] = part[name][i : i + rows].values
+            values = values.reshape(*sizes, *first.shape)
             variables[name] = ((*self.words, *first.dims), values, first.attrs)
         coordinates: dict[str, Any] = {
             address: (address, list(words), {"long_name": address_words(self.case, address)})
@@ -247,7 +260,7 @@ def compute_word_sweep(
         if i not in computed:
             computed[i] = _compute_part(part, part_path, client, progress_bar)
     datasets = [computed[i] for i in range(len(plan.sweeps))]
-    joined = plan.join(datasets)
+    joined = plan.join(datasets, None if path is None else path / BLOCKS_GROUP)
     for quantity, error in _estimates(plan, datasets).items():
         joined[f"peak_{quantity}"].attrs["truncation_error"] = error
     if set(plan.sweeps[0].dims) - set(plan.dims):  # words alone
@@ -307,14 +320,17 @@ def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[st
 
 def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
     """Dataset of the sweep of numbers for one combination of words."""
-    found = None if path is None else sweep_store.status(path)
-    if path is not None and found == ("complete", part.fingerprint()):
-        progress_bar.skip(part.count)
-        return sweep_store.read_dataset(path)
+    if path is None:
+        return compute_sweep(part, None, "new", client, progress_bar, estimates=False)
+    found = sweep_store.status(path)
     if found and found[1] != part.fingerprint():
         raise ValueError(f"{path} is not the part of its sweep that its place says")
-    state = "new" if found is None else "resume"
-    return compute_sweep(part, path, state, client, progress_bar, estimates=False)
+    if found and found[0] == "complete":
+        progress_bar.skip(part.count)
+    else:
+        state = "new" if found is None else "resume"
+        compute_sweep(part, path, state, client, progress_bar, estimates=False)
+    return read_dataset(path)
 
 
 SINGLE_RUNS = f"{OUTSIDE}, or differentiate jaxbeam.simulate of each run"
@@ -385,7 +401,9 @@ def sweep(
     `error_estimate`.
 
     Blocks have as many runs as `memory` allows, in bytes or with a unit ("2 GB"), by default a
-    quarter of what is free; the progress line says how many. Results in memory are not counted.
+    quarter of what is free; the progress line says how many. Results in memory are not counted;
+    with a `store` histories stay in its files, from which the dataset reads what is used, so that
+    they may be larger than the memory.
 
     With a `store` each block is written to a zarr store when it is done; with `resume` an
     interrupted sweep continues from there, with bit-identical results. With a `client` of Dask
@@ -427,16 +445,18 @@ def sweep(
 
     def stored(path: Path) -> "xarray.Dataset":
         with writing(path.absolute(), plan.fingerprint(), resume, overwrite) as place:
-            if place.state == "complete":
-                return read_dataset(place.folder)
 
             def kept() -> str:
                 again = "the same command goes on" if overwrite else "resume it, with --resume"
                 unfinished = (place.folder / "zarr.json").exists()
                 return f"{kept_blocks(place.folder)} in {path}: {again}" if unfinished else ""
 
-            with keeping(kept):
-                return computed(*place)
+            if place.state == "complete":
+                read_dataset(place.folder)  # a damaged one is refused before it replaces another
+            else:
+                with keeping(kept):
+                    computed(*place)
+        return read_dataset(path)
 
     dataset = computed(None, "new") if store is None else stored(Path(store))
     warn_of_failures(dataset)

@@ -5,6 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
@@ -13,6 +14,7 @@ from jaxbeam.sweeps import computation
 from jaxbeam.sweeps.blocks import SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, LEAST_BYTES, PHASE
 from jaxbeam.sweeps.specification import sweep_specification
+from jaxbeam.sweeps.store import create_store, read_dataset
 
 TRAIN = jb.Axles(speed=50.0, offsets=np.arange(10) * 3.0, forces=[1e5] * 10)
 HEAVY = dataclasses.replace(TRAIN, masses=[100.0] * 10)
@@ -161,3 +163,31 @@ def test_sweeps_of_loads_that_stand_are_sized(name):
         decay = np.real(np.exp(np.outer(t, pole)) * (1 - 1j * ratio / np.sqrt(1 - ratio**2)))
         history = (1 - decay) @ (np.sin(10.0 * n) * forces / omega**2)
         assert_allclose(peak, np.max(np.abs(history)), rtol=1e-6)
+
+
+def test_collecting_takes_less_memory_than_all_blocks(tmp_path):
+    """80 MB in blocks of 1 MB, of runs in any order; the last block repeats its last run."""
+    order = np.random.default_rng(1).permutation(159)
+    index = np.concatenate([order, [-1]]).reshape(-1, 2)[:, [1, 0]]
+    store = create_store(tmp_path / "runs.zarr", "a" * 64, {}, np.ones(1))
+    for block, rows in enumerate(index):
+        values = np.maximum(rows, 0)[None, :, None, None] + np.linspace(0.0, 0.5, 64_000)[:, None]
+        store.write(block, {"deflection": values})
+    tracemalloc.start()
+    flat = store.collect(80, index)["deflection"]
+    variables = {"deflection": (("run", "time", "sensor"), flat, {})}
+    store.finish(xarray.Dataset(variables, attrs={"jaxbeam_sweep": "a" * 64}))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    found = read_dataset(tmp_path / "runs.zarr").deflection
+    assert most < 0.6 * 80e6 < found.nbytes  # zarr compresses some chunks at once
+    assert_array_equal(found[:, -1, 0], np.arange(159) + 0.5)
+
+
+@pytest.mark.parametrize("seeds", [{}, {"loads.0.seed": [1, 2]}], ids=["numbers", "seeds"])
+def test_stored_histories_are_those_in_memory(tmp_path, seeds):
+    load = jb.Crowd(speed=5.0, pace=2.0, people=2, length=5.0) if seeds else TRAIN
+    case = case_of(UNIFORM, load, "deflection", 2)
+    options = {"over": seeds | SPEEDS, "histories": True, "progress": False}
+    found = jb.sweep(case, store=tmp_path / "runs.zarr", **options)
+    xarray.testing.assert_equal(found, jb.sweep(case, **options))
