@@ -21,15 +21,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.validation.measured_forces import EXCITATIONS as MEASURED, forced_log
 from experiments.validation.modal_identification import (
-    DURATIONS,
     FIRST_SEED,
     MATCH_ERROR,
     MIN_ENERGY,
     WORDS,
+    band_of,
     compare,
     log_of,
+    planted_log,
 )
 from jaxbeam.files.report import ReportTable
 from jaxbeam.runtime.printer import markdown_table
@@ -64,12 +64,6 @@ class Estimates(NamedTuple):
     covered: Float[np.ndarray, "mode 2"] | None
     false: int
     seconds: float
-
-
-def band_of(planted: Planted) -> tuple[float, float]:
-    """Band (Hz) that holds all modes."""
-    frequencies = planted.structure.frequencies
-    return 0.7 * frequencies[0], min(1.25 * frequencies[-1], 0.45 * planted.rate)
 
 
 def ours(planted: Planted, method: str) -> Estimates:
@@ -154,12 +148,7 @@ def excitations(count: int) -> ReportTable:
         structures: list[Planted] = []
         found: dict[str, list[Estimates]] = {PYOMA: [], JAXBEAM: []}
         for seed in range(FIRST_SEED, FIRST_SEED + count):
-            structure = random_structure(seed)
-            if kind in MEASURED:
-                log, planted = forced_log(structure, kind, seed)
-            else:
-                planted = sampled(structure, kind, seed, DURATIONS[kind])
-                log = log_of(planted)
+            log, planted = planted_log(kind, seed)
             structures.append(planted)
             found[PYOMA].append(pyoma(planted))
             found[JAXBEAM].append(automatic(planted, log))

@@ -3,13 +3,12 @@
     python -m experiments.validation.planted_modes 30
     python -m experiments.validation.planted_modes 30 crossing shaken
 
-Thirty random structures by finite elements for each kind, the same as in `modal_identification` and
-`measured_forces`, with other seeds than those from which rules were chosen. The table is written
-for the page on logs; it takes half an hour on one core. A second table lists the strong modes that
-were missed, and whether any method could find them: the least 95 % intervals are those of an
-unbiased method that knows the noise, the number of modes, and more (`least_errors`); what pyOMA-2
-finds stable within 2 % of the mode, given its frequency, is in the last column: it may be a
-harmonic.
+Thirty random structures by finite elements for each kind, the same as in `modal_identification`,
+with other seeds than those from which rules were chosen. The table is written for the page on logs;
+it takes half an hour on one core. A second table lists the strong modes that were missed, and
+whether any method could find them: the least 95 % intervals are those of an unbiased method that
+knows the noise, the number of modes, and more (`least_errors`); what pyOMA-2 finds stable within
+2 % of the mode, given its frequency, is in the last column: it may be a harmonic.
 """
 
 import sys
@@ -18,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.validation import measured_forces, modal_identification
 from experiments.validation.least_errors import (
     QUANTILE,
     LeastErrors,
@@ -28,11 +26,19 @@ from experiments.validation.least_errors import (
     least_errors_of_forced,
     why_unidentifiable,
 )
-from experiments.validation.modal_identification import FIRST_SEED, WORDS, PlantedComparison
+from experiments.validation.modal_identification import (
+    DURATIONS,
+    FIRST_SEED,
+    FORCED,
+    WORDS,
+    PlantedComparison,
+    assess,
+    planted_log,
+)
 from experiments.validation.modal_methods import pyoma
 from jaxbeam.files.report import ReportTable
 from jaxbeam.runtime.printer import markdown_table
-from tests.oracles.planted_structures import Planted, random_structure, sampled
+from tests.oracles.planted_structures import Planted
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "planted_modes.md"
 MISSED_FILE = TABLE_FILE.with_name("planted_missed.md")
@@ -102,17 +108,10 @@ def missed_rows(kind: str, words: str, seed: int, found: PlantedComparison) -> l
 
 def _planted(kind, seed) -> tuple[Planted, LeastErrors, float]:
     """Planted structure, the least errors under that excitation, and duration (s)."""
-    structure = random_structure(seed)
-    if kind in measured_forces.EXCITATIONS:
-        log, planted = measured_forces.forced_log(structure, kind, seed)
+    (log, planted), duration = planted_log(kind, seed), DURATIONS[kind]
+    if kind in FORCED:
         inputs = log.values.shape[1] - planted.values.shape[1]
-        return (
-            planted,
-            least_errors_of_forced(planted, log.values[:, :inputs]),
-            measured_forces.DURATION,
-        )
-    duration = modal_identification.DURATIONS[kind]
-    planted = sampled(structure, kind, seed, duration)
+        return planted, least_errors_of_forced(planted, log.values[:, :inputs]), duration
     if kind in RANDOM:
         return planted, least_errors(planted, duration, kind == "shaken"), duration
     return planted, least_errors_of_decays(planted), duration
@@ -125,8 +124,6 @@ def table(
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     rows, missed = [], []
     for kind in kinds:
-        forced = kind in measured_forces.EXCITATIONS
-        assess = measured_forces.assess if forced else modal_identification.assess
         found = assess(kind, seeds)
         rows.append(row(kind, found))
         for seed, one in zip(seeds, found, strict=True):

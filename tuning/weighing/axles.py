@@ -74,16 +74,8 @@ class AxleWeighing:
     def to_dict(self) -> dict:
         """Axle loads with intervals by both methods, groups, spacings, speed (SI), for JSON."""
         fit, count = self.fit, self.fit.forces.size
-        numbers = [
-            {"value": float(value), "standard_error": float(error), "interval_95": pair.tolist()}
-            for value, error, pair in zip(fit.values, fit.errors, self.intervals, strict=True)
-        ]
-        by_moses = [
-            {"value": float(force), "standard_error": float(error), "interval_95": pair.tolist()}
-            for force, error, pair in zip(
-                self.moses.forces, self.moses.errors, self.moses.intervals, strict=True
-            )
-        ]
+        numbers = _numbers(fit.values, fit.errors, self.intervals)
+        by_moses = _numbers(self.moses.forces, self.moses.errors, self.moses.intervals)
         return {
             "axles": numbers[:count],
             "groups": [{"axles": own, **_of_weight(fit.group_weight(own))} for own in self.groups],
@@ -133,6 +125,13 @@ class AxleWeighing:
                 "  [--axles NUMBER]"
             )
         return "\n".join(lines)
+
+
+def _numbers(values, errors, intervals) -> list[dict]:
+    return [
+        {"value": float(value), "standard_error": float(error), "interval_95": pair.tolist()}
+        for value, error, pair in zip(values, errors, intervals, strict=True)
+    ]
 
 
 def _of_weight(weight: tuple[float, float]) -> dict:
