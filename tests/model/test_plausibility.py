@@ -50,6 +50,8 @@ def test_a_weight_for_a_mass_per_length_is_noticed():
     assert f"sags by {sag:.2f}" in sentence and "not a weight in N" in sentence
     on_springs = [jb.Support(12.5, stiffness=1e8)]
     assert jb.check(bridge({"mass_per_length": weight}, on_springs)).warnings == ()
+    hung = {"length": 200.0, "flexural_rigidity": 1.2e12}  # 0.35 Hz, as an arch or a cable has
+    assert jb.check(bridge(hung, run={"duration": 9.0})).warnings == ()
 
 
 def test_the_demonstration_is_plausible():

@@ -17,6 +17,7 @@ from jaxbeam.model.state_space import poles
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500
 LEAST_DECK = 100.0  # kg/m: beams of less are no decks, but of unit mass
+LONGEST_GIRDER = 150.0  # m: the weight of longer spans hangs on cables or stands on arches
 CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
 
 
@@ -127,7 +128,8 @@ def sag_of_bridge(facts):
     The stress of steel at a distance c from the neutral axis is (48/5) E sag c / span^2: with
     span / c = 50 it is 200 MPa at a sag of span/190.
     """
-    if facts.is_bridge and facts.density > LEAST_DECK and not list(_soft(facts)):
+    is_girder = facts.is_bridge and facts.numbers.span <= LONGEST_GIRDER
+    if is_girder and facts.density > LEAST_DECK and not list(_soft(facts)):
         yield from sag_of_beam(facts)
 
 
