@@ -56,6 +56,36 @@ def test_settled_supports(folder, run):
     assert f"{expected}; sensors read changes from there" in run("simulate case.toml")
 
 
+CAR_AND_ABSORBER = """
+[beam]
+length = 20.0
+flexural_rigidity = 2e10
+mass_per_length = 12e3
+[[absorbers]]
+position = 10.0
+mass = 2000.0
+frequency = 4.0
+damping_ratio = 0.1
+[[loads]]
+kind = "oscillator"
+mass = 15e3
+stiffness = 1e6
+speed = 22.0
+[run]
+duration = 1.0
+sample_rate = 200.0
+"""
+
+
+def test_absorbers_beside_vehicles_have_no_measures_of_ride(folder, run):
+    """The command ended in an error of zip()."""
+    (folder / "both.toml").write_text(CAR_AND_ABSORBER)
+    rows = [line.split() for line in run("simulate both.toml").splitlines()]
+    (absorber,) = [row for row in rows if row[:2] == ["absorbers.0", "body"]]
+    (vehicle,) = [row for row in rows if row[:1] == ["loads.0"]]
+    assert absorber[-3:] == ["-"] * 3 and len(vehicle) == len(absorber)
+
+
 def test_case_of_a_train_in_words(run, folder):
     """Units with prefixes, when the loads are on the beam, the first and the last of 50 axles."""
     run("new railway-bridge")

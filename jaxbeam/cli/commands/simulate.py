@@ -180,6 +180,7 @@ def _body_lines(record: "jb.Record") -> list[str]:
     if ride is not None:
         header += ("W_k rms (m/s^2)", "VDV (m/s^1.75)", "Sperling W_z")
     rows = [(name, *(f"{v:.4g}" for v in row)) for name, row in heights.items()]
+    rows = [row + ("-",) * (len(header) - len(row)) for row in rows]  # absorbers have no rides
     return table(header, rows)
 
 
