@@ -10,7 +10,9 @@ of a mass-normalised shape psi is
 
     a = max|psi| integral of p |psi| dx / (2 zeta),      p = P n' / L  (N/m).
 
-Lateral streams, in which people fall in step with the bridge, are not in the model.
+P is that of the harmonic of the pace which is nearest to f; the pace is 2.188 - 0.644 d + 0.099 d^2
+Hz at a density d (CSA S7, 7.3.3.3). Lateral streams, in which people fall in step with the bridge,
+are not in the model.
 """
 
 import dataclasses
@@ -26,6 +28,8 @@ from jaxbeam.runtime.printer import TableViews
 DENSITIES = {"TC2": 0.2, "TC3": 0.5, "TC4": 1.0, "TC5": 1.5}  # people/m^2 of traffic classes
 COMFORT = {"CL1": 0.5, "CL2": 1.0, "CL3": 2.5}  # m/s^2, largest vertical acceleration of a class
 FORCE = 280.0  # N, first harmonic of a person: 0.4 of 700 N
+# Of the first five harmonics, 0.4, 0.1, 0.042, 0.041 and 0.027 of the weight, over the first.
+HARMONICS = 1.0, 0.25, 0.105, 0.1025, 0.0675
 DENSE = 1.0  # people/m^2: density from which on paces are no longer free
 POINTS = 2001  # along the beam, of the integral of a shape
 
@@ -67,15 +71,34 @@ def comfort_class(acceleration: float) -> str:
     return next((name for name, limit in COMFORT.items() if acceleration <= limit), "")
 
 
+def harmonic_fractions(
+    frequencies: Float[np.ndarray, " mode"], density: float
+) -> Float[np.ndarray, " mode"]:
+    """Forces of people at some frequencies (Hz), as fractions of their first harmonic.
+
+    Each is that of the harmonic of the pace at the `density` (people/m^2) which is nearest; 0 below
+    half the pace, and beyond the fifth harmonic.
+
+    >>> import numpy as np
+    >>> from jaxbeam.analysis.footbridges import harmonic_fractions
+    >>> print(harmonic_fractions(np.array([0.5, 2.0, 4.2, 12.0]), 0.5))
+    [0.   1.   0.25 0.  ]
+    """
+    pace = 2.188 - 0.644 * density + 0.099 * density**2
+    harmonic = np.rint(frequencies / pace).astype(int)
+    return np.array([0.0, *HARMONICS, 0.0])[np.minimum(harmonic, len(HARMONICS) + 1)]
+
+
 def stream_response(
-    case: Case, density: float | str, width: float, reduction=1.0, force: float = FORCE
+    case: Case, density: float | str, width: float, reduction=None, force: float = FORCE
 ) -> StreamResponse:
     """Accelerations of the modes of a footbridge under a stream of people on the whole deck.
 
     `density` is one of `DENSITIES`, or people/m^2; `width` that of the deck (m). `reduction`, one
-    number or one for each mode, is the fraction of `force` (N) at its frequency, for paces that are
-    rare; 0 leaves a mode out. Each mode is taken by itself, in resonance. Raises ValueError for an
-    unknown class and for numbers that are not positive.
+    number or one for each mode, is the fraction of `force` (N), that of the first harmonic, at its
+    frequency; 0 leaves a mode out. If left out, it is that of the nearest harmonic
+    (`harmonic_fractions`). Each mode is taken by itself, in resonance, on the beam without the mass
+    of the people. Raises ValueError for an unknown class and for numbers that are not positive.
 
     >>> import jaxbeam as jb
     >>> from jaxbeam.analysis.footbridges import stream_response
@@ -100,6 +123,8 @@ def stream_response(
     equivalent = free if density < DENSE else np.full(ratios.shape, 1.85 * np.sqrt(people))
     x = np.linspace(0.0, length, POINTS)
     shapes = np.abs(np.asarray(found.shapes(x)))  # mass-normalised, (position, mode)
+    if reduction is None:
+        reduction = harmonic_fractions(np.asarray(found.frequencies), density)
     load = np.asarray(reduction) * force * equivalent / length
     pushed = load * np.trapezoid(shapes, x, axis=0)
     accelerations = pushed * shapes.max(axis=0) / (2 * ratios)

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.footbridges import comfort_class, stream_response
+from jaxbeam.analysis.footbridges import comfort_class, harmonic_fractions, stream_response
 
 LENGTH, MASS, DAMPING, WIDTH = 40.0, 2500.0, 0.02, 3.0
 BRIDGE = jb.Case(jb.Beam(LENGTH, 10.4e9, MASS, damping_ratio=DAMPING, modes=2))
@@ -26,7 +26,7 @@ def test_stream_on_a_pinned_beam(density, people, in_step):
 
 def test_people_in_step_have_the_acceleration_of_the_stream():
     """Thirty people of a share of the force each, in the direction of the second mode, in time."""
-    found = stream_response(BRIDGE, "TC2", WIDTH)
+    found = stream_response(BRIDGE, "TC2", WIDTH, reduction=1.0)
     count = 30
     amplitude, pace = 280 * found.equivalent[1] / count, [found.frequencies[1]]
     people = [
@@ -39,6 +39,25 @@ def test_people_in_step_have_the_acceleration_of_the_stream():
     record = jb.simulate(case)
     last = np.asarray(record.sensor_values[record.times > 5.0, 0])
     assert_allclose(np.abs(last).max(), found.accelerations[1], rtol=0.01)
+
+
+def test_modes_are_pushed_by_the_nearest_harmonic():
+    """Modes of 2 and 8 Hz, the first and the fourth harmonic of a pace of 1.89 Hz (CSA S7)."""
+    found = stream_response(BRIDGE, "TC3", WIDTH)
+    assert_allclose(found.frequencies, [2.0, 8.0], rtol=2e-3)
+    whole = stream_response(BRIDGE, "TC3", WIDTH, reduction=1.0)
+    assert_allclose(found.accelerations / whole.accelerations, [1.0, 0.041 / 0.4], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("density", "frequency", "of_weight"),
+    [(1.0, 1.643, 0.4), (1.0, 0.82, 0.0), (1.0, 2.46, 0.4), (1.0, 2.47, 0.1), (0.2, 9.03, 0.041)]
+    + [(0.2, 9.3, 0.027), (0.2, 11.3, 0.027), (0.2, 11.4, 0.0)],
+)
+def test_forces_of_harmonics(density, frequency, of_weight):
+    """Paces of 1.643 and 2.063 Hz by hand."""
+    found = harmonic_fractions(np.array([frequency]), density)
+    assert_allclose(0.4 * found, of_weight, atol=1e-12)
 
 
 def test_comfort_classes_and_wrong_numbers():
