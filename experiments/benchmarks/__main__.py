@@ -34,6 +34,7 @@ BENCHMARKS = {
         "one and two spans, loops, histories: scipy and diffrax", "--quick", "--modes 3"
     ),
     "first_answer": Benchmark("first answers of fresh processes: a script with scipy", "--quick"),
+    "engine": Benchmark("first gradients, loops and sweeps of fresh processes", "'grad by mass'"),
     "trains": Benchmark("ten trains at many speeds: a script with numpy", "--speeds 5"),
     "vehicles": Benchmark("quarter cars: moving masses, and a script with scipy", "--runs 20"),
     "growth": Benchmark(
