@@ -23,6 +23,7 @@ from jaxbeam.analysis.linearised_loop import (
 )
 from jaxbeam.analysis.stability import (
     _assignment,
+    _tracked_branches,
     frozen_poles,
     growth,
     margins,
@@ -70,17 +71,20 @@ def shaker_case(controller, modes=3, force_per_volt=4.6, loads=None, sensors=1):
 
 
 def state_matrices(x, speed, mass, force_per_volt, modes=3):
-    """State and input matrices in the sine basis, eqs (2.11) and (2.36) corrected."""
+    """State and input matrices in the sine basis, eqs (2.11) and (2.36) corrected.
+
+    Of masses at one position or at several.
+    """
     n = np.arange(1, modes + 1) * np.pi / LENGTH
     modal_mass = DENSITY * LENGTH / 2
     omega = n**2 * np.sqrt(RIGIDITY / DENSITY)
-    shaker, load_shape = np.sin(n * SHAKER_POSITION), np.sin(n * x)
-    slope, curvature = n * np.cos(n * x), -(n**2) * np.sin(n * x)
-    M = modal_mass * np.eye(modes) + mass * np.outer(load_shape, load_shape)
+    shaker, angle = np.sin(n * SHAKER_POSITION), np.outer(x, n)
+    weighted = (np.reshape(mass, (-1, 1)) * np.sin(angle)).T
+    M = modal_mass * np.eye(modes) + weighted @ np.sin(angle)
     C = modal_mass * np.diag(2 * RATIO * omega) + DAMPER * np.outer(shaker, shaker)
-    C += 2 * mass * speed * np.outer(load_shape, slope)
+    C += 2 * speed * weighted @ (n * np.cos(angle))
     K = modal_mass * np.diag(omega**2) + SPRING * np.outer(shaker, shaker)
-    K += mass * speed**2 * np.outer(load_shape, curvature)
+    K -= speed**2 * weighted @ (n**2 * np.sin(angle))
     A = np.zeros((2 * modes + 1,) * 2)
     A[:modes, modes:-1] = np.eye(modes)
     A[modes:-1, :modes] = -np.linalg.solve(M, K)
@@ -166,6 +170,14 @@ def test_a_jacobian_at_a_known_point_has_derivatives_by_traced_numbers():
         return affine_jacobian(lambda x: factor**2 * (matrix @ x), np.zeros(3))
 
     np.testing.assert_allclose(jax.jacfwd(jacobian)(3.0), 6.0 * matrix, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [20, 21])  # of times, without and with that of the crossing
+def test_branches_that_cross_go_on_straight(count):
+    t = np.linspace(-1, 1, count)
+    up, down = -1 + 0.5 * t + 3j, -1 - 0.4 * t + 3.005j
+    followed = _tracked_branches(np.sort(np.stack([up, down], axis=1), axis=1))
+    np.testing.assert_array_equal(followed, np.stack([up, down], axis=1))
 
 
 @pytest.mark.parametrize("spread", [1.0, 0.01])

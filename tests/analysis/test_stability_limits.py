@@ -179,6 +179,30 @@ def test_stream_of_a_sampled_loop():
     np.testing.assert_allclose(np.sort(np.abs(found.multipliers))[-3:], largest, rtol=2e-4)
 
 
+@pytest.mark.parametrize("period", [None, 1e-3])
+def test_stream_of_loads_closer_than_a_crossing(period):
+    """Every 20 ms a mass of 30 ms on the beam, by scipy; given by its speed, or by a table."""
+    row, speed = np.array([[300.0, -800.0, 12.0, 0.5, 0.0]]), 20.0
+    case = state_feedback_case(row, speed, MASS)
+    if period is not None:
+        table = jb.MovingMass(mass=MASS, times=[-0.01, 0.04], positions=[-0.2, 0.8])
+        law = dataclasses.replace(case.controller, period=np.asarray(period))
+        case = dataclasses.replace(case, controller=law, loads=(table,))
+    found = stream(case, 0.02)
+
+    def matrices_at(t):
+        masses = MASS * np.array([1.0, t < 0.01])
+        A, B = state_matrices(speed * np.array([t, t + 0.02]), speed, masses, 4.6, modes=2)
+        return (A - B @ row, 0 * B) if period is None else (A, B)
+
+    held, transition = 0.02 if period is None else period, np.eye(5)
+    for start in np.arange(0.0, 0.02 - 1e-9, held):
+        A, B = over_period(matrices_at, start, start + held, [0.01])
+        transition = (A - B @ row) @ transition
+    largest = np.sort(np.abs(np.linalg.eigvals(transition)))[-3:]
+    np.testing.assert_allclose(np.sort(np.abs(found.multipliers))[-3:], largest, rtol=2e-4)
+
+
 def test_crossing_amplifies_with_stable_frozen_poles(monkeypatch):
     """Deviations grow more than twentyfold; all frozen poles are left of -2.5 1/s."""
     monkeypatch.setattr(oracle, "DAMPER", 166.8)

@@ -85,6 +85,14 @@ def test_cubics_are_the_positions():
     assert_allclose(found, LOADS.kinematics(np.float64(0.6))[0])
 
 
+def test_cubics_of_axles_that_go_left_and_speed_up():
+    """x = L + d - v t - a t^2 / 2 of an axle d behind the first."""
+    row = jb.Axles(offsets=[0.0, 3.0, 7.0], forces=1e3, speed=-12.0, deceleration=-2.0)
+    starts, cubics = load_set(jb.Case(CASE.beam, loads=[row])).cubics()
+    assert_array_equal(starts[:, 0], 0.0)
+    assert_allclose(cubics[:, 0], [[20.0 + d, -12.0, -1.0, 0.0] for d in (0.0, 3.0, 7.0)])
+
+
 def test_motion_of_the_surface_is_that_of_its_height():
     """By differences along the path, of a load that brakes."""
     load = jb.MovingMass(1.0, speed=20.0, deceleration=6.0)

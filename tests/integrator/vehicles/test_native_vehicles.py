@@ -19,6 +19,8 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import static_shapes
+from tests.oracles.crossing import Load
+from tests.oracles.modal_equations import Span, respond
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 
@@ -147,3 +149,25 @@ def test_sweeps_of_vehicles_take_their_steps_in_c():
     assert native_peaks.supports(case_of("rough")) and native_peaks.supports(case_of("forced"))
     settled = dataclasses.replace(case, supports=(jb.Support(6.0, settlement=1e-3),))
     assert not native_peaks.supports(settled)
+
+
+def test_sweeps_of_axles_that_go_left_and_speed_up_are_those_of_scipy():
+    """Forces and masses 4 m apart, in the peaks of sweeps, which follow the cubics of the paths."""
+    times = np.linspace(0.0, 1.5, 3001)
+    assert native_peaks.available()
+    beam = jb.Beam(20.0, 2e10, 1.2e4, 0.02, modes=3)
+    span = Span(20.0, 2e10, 1.2e4, modes=3, damping_ratio=0.02)
+    sensors = [jb.Sensor(7.0), jb.Sensor(12.0)]
+    over = {"loads.0.deceleration": [-6.0, 3.0]}
+    for kind, numbers in (("force", {"forces": 9e4}), ("mass", {"masses": 9e4 / 9.81})):
+        row = jb.Axles(offsets=[0.0, 4.0], speed=-18.0, start_position=20.0, **numbers)
+        case = jb.Case(beam, sensors=sensors, loads=[row], run=jb.Run(1.5))
+        found = jb.sweep(case, over, progress=False).peak_deflection
+        for deceleration, peaks in zip(over["loads.0.deceleration"], found, strict=True):
+            # The second enters later, and faster or slower.
+            speed = np.sqrt(18.0**2 - 8.0 * deceleration)
+            entry = (18.0 - speed) / deceleration
+            axles = (18.0, 0.0), (speed, entry)
+            loads = [Load(9e4 / 9.81, -v, t, deceleration, kind) for v, t in axles]
+            expected = respond(span, loads, [7.0, 12.0], times).deflection
+            assert_allclose(peaks, np.max(np.abs(expected), axis=0), rtol=1e-4)
