@@ -196,9 +196,8 @@ def number_in_si(value: Any, unit: str, name: str) -> float:
     try:
         return float(converted)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} takes a number in {unit}, or one with a unit, not {value!r}"
-        ) from None
+        wanted = "a plain number" if unit == "1" else f"a number in {unit}, or one with a unit"
+        raise ValueError(f"{name} takes {wanted}, not {value!r}") from None
 
 
 @functools.cache

@@ -249,6 +249,9 @@ def test_refusals():
     rayleigh = dataclasses.replace(BRIDGE.beam, damping_ratio=[0.01, 0.02], modes=2)
     with pytest.raises(ValueError, match="set beam.modes to 3 or more"):
         jb.assess(dataclasses.replace(BRIDGE, beam=rayleigh), 40.0)
+    stiff = dataclasses.replace(BRIDGE, beam=jb.Beam(1.0, 3e10, 15e3))
+    with pytest.raises(ValueError, match="first frequency of 2221 Hz"):
+        jb.assess(stiff, 40.0, dynamic=True, progress=False)
     controlled = dataclasses.replace(
         BRIDGE,
         actuators=[jb.PointForce(12.5)],

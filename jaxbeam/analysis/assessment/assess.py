@@ -15,7 +15,7 @@ from jaxbeam.analysis.assessment.checks import (
     train_checks,
 )
 from jaxbeam.analysis.sections import spans
-from jaxbeam.case.case import Case, Run
+from jaxbeam.case.case import Case, Run, check_is_case
 from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced, suggestion
 from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.track import THREE_SLEEPERS, Track, track_of
@@ -48,6 +48,7 @@ def assess(
     lowest_speed=None,
     trains: Sequence[str] = HSLM_A,
     dynamic: bool | None = None,
+    progress: bool = True,
 ) -> Assessment:
     """Checks of a railway bridge by EN 1991-2, section 6.4, and EN 1990, annex A2.
 
@@ -72,8 +73,9 @@ def assess(
     open source is left out and named in the report.
 
     Raises ValueError for an unknown code, deck, track or train, a track of layers, a controlled
-    case, several spans without a determinant length, a beam that can move as a rigid body, or
-    numbers that are out of range or traced by JAX.
+    case, several spans without a determinant length, a beam that can move as a rigid body, one
+    so stiff that a train lasts too many of its periods to be analysed, or numbers that are out of
+    range or traced by JAX. A line shows the `progress` of the dynamic analysis, train by train.
 
     >>> import jaxbeam as jb
     >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
@@ -81,16 +83,20 @@ def assess(
     >>> print(found.checks[1].subject, found.checks[1].outcome)
     dynamic analysis not required
     """
+    check_is_case(case)
     if track in DECKS:
         raise ValueError(f"track is its state, {' or '.join(TRACKS)}; {track!r} is the deck")
     given = dict(deck=deck, track=track, code=code)
     for (name, word), allowed in zip(given.items(), (DECKS, TRACKS, CODES), strict=True):
         if word not in allowed:
             raise ValueError(f"{name} cannot be {word!r}; {suggestion(word, allowed)}")
+    trains = (trains,) if isinstance(trains, str) else tuple(trains)
     for train in trains:
         if train not in library() or library()[train].forces is None:
             raise ValueError(f"{train!r} is no train of forces; {suggestion(train, HSLM_A)}")
     numbers = code_numbers()
+    classification = number_in_si(classification, "1", "classification")
+    added_damping = number_in_si(added_damping, "1", "added_damping")
     speed = number_in_si(line_speed, "m/s", "line_speed")
     lowest = numbers["line_speed"]["lowest"] if lowest_speed is None else lowest_speed
     lowest = number_in_si(lowest, "m/s", "lowest_speed")
@@ -128,7 +134,7 @@ def assess(
         highest = numbers["line_speed"]["design_factor"] * speed
         lowest = min(lowest, highest / 1.2)
         state = TrackState(length, float(frequencies[0]), track, classification)
-        found, effects = train_checks(bridge, trains, (lowest, highest), deck, state)
+        found, effects = train_checks(bridge, trains, (lowest, highest), deck, state, progress)
         checks += found
     left_out = list(numbers["left_out"]["items"])
     if not (dynamic or (dynamic is None and is_required)):

@@ -51,6 +51,7 @@ from jaxbeam.model.output_rows import (
     static_correction,
 )
 from jaxbeam.model.statics import REACTION
+from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.sweeps.computation import failure_sentence, peaks_in_memory
 from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.specification import sweep_specification
@@ -247,6 +248,7 @@ NEAR_LARGEST = 0.8  # fraction of the largest response from which on a peak over
 MAX_ROUNDS = 4
 TOLERANCE = 1e-4  # of peaks
 NEAR = 1e-6  # m, from a support to a sensor next to it
+MOST_PERIODS = 1e7  # of the highest mode that counts, over the first speeds of a train: 3 s
 RUNS_AT_ONCE = 8  # whose reactions are computed together
 FREE_PERIODS = 2.0  # of the first mode, simulated after a train has left
 
@@ -278,7 +280,7 @@ def train_response(
 
     First in steps of 2 %, and at the resonance speeds of the first mode; then around every peak
     near the largest one, until it changes by less than a hundredth. Raises RuntimeError if a run
-    fails.
+    fails, ValueError if there are more periods to follow than in any bridge.
     """
     offsets, forces = library()[train].offsets, library()[train].forces
     load = Axles(speed=highest, offsets=offsets, forces=forces)
@@ -310,6 +312,15 @@ def train_response(
         return np.concatenate([peaks, found], axis=-1)
 
     speeds = _first_speeds(loaded, lowest, highest)
+    frequencies = concrete(modes(case).frequencies)
+    periods = float(frequencies[-1] * np.sum(way / speeds + free))
+    if periods > MOST_PERIODS:
+        raise ValueError(
+            f"the dynamic analysis would follow {periods:.1e} periods under {train} alone, as the"
+            f" beam has a first frequency of {frequencies[0]:.4g} Hz and {speeds.size} speeds at or"
+            f" next to its resonances: is beam.flexural_rigidity in N m^2 and beam.mass_per_length"
+            " in kg/m? Or else give a higher lowest_speed"
+        )
     count, peaks, change = speeds.size, peaks_at(speeds), np.inf
     quantities = [sensor.quantity for sensor in sensors] + ["reaction"] * len(reactions)
     quantities = np.array(quantities)
@@ -402,12 +413,17 @@ class TrackState(NamedTuple):
 
 
 def train_checks(
-    case: Case, trains: Sequence[str], speeds: tuple[float, float], deck: str, state: TrackState
+    case: Case,
+    trains: Sequence[str],
+    speeds: tuple[float, float],
+    deck: str,
+    state: TrackState,
+    progress: bool = False,
 ) -> tuple[list[CodeCheck], TrainEffects]:
     """Checks of the effects of trains between two speeds (m/s), and the curves of all effects.
 
     Deck acceleration against its limit; each section force, reaction and displacement against
-    LM71. Calculated values are multiplied by the factor for the track.
+    LM71. Calculated values are multiplied by the factor for the track. A bar shows the `progress`.
     """
     decks = [p for p in characteristic_points(case) if not p.name.startswith("support")]
     sections = checked_sections(case)
@@ -419,7 +435,11 @@ def train_checks(
         *(Sensor(p.x, p.quantity, side=p.side if p.quantity == "shear" else "") for p in measured),
     )
     reactions = tuple(section.x for section in inner)
-    responses = [train_response(case, train, sensors, *speeds, reactions) for train in trains]
+    responses = []
+    with ProgressBar(len(trains), "train", shown=progress) as bar:
+        for train in trains:
+            responses.append(train_response(case, train, sensors, *speeds, reactions))
+            bar.update()
     curves = [
         TrainCurve(
             one.train,

@@ -86,6 +86,7 @@ def assess(
         added_damping=added_damping,
         lowest_speed=_number_or_quantity(lowest_speed),
         dynamic=True if dynamic else None,
+        progress=not options.json_,
         **({"trains": train} if train else {}),
     )
     if output:
