@@ -20,14 +20,16 @@ from jaxtyping import Float
 from jaxbeam.case.case import (
     ALL,
     Case,
+    check_distinct,
+    each_address,
     list_sizes,
-    overlap,
     replace,
     stack_cases,
     unit_at,
     value_at,
 )
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.former_words import attribute_address
 from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, xla_options
@@ -297,18 +299,15 @@ def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:
 
 
 def _check_unique(addresses: list[str], cases: list[Case]) -> None:
-    """Refuse an address that is free twice: for all logs and for one, or for all loads and one."""
-    for address in addresses:
-        own = LOG_ADDRESS.fullmatch(address)
-        if own and own[2] in addresses:
-            raise ValueError(
-                f"{address} is free twice, as {own[2]} is free for all logs together; "
-                "leave one of them out"
-            )
-    shared = [address for address in addresses if not LOG_ADDRESS.fullmatch(address)]
-    twice = overlap(shared, list_sizes(cases[0]))
-    if twice:
-        raise ValueError(f"{twice} is free twice; name it once")
+    """Refuse a number that is free twice: for all logs and for one, or for all loads and one."""
+    for i, case in enumerate(cases):
+        local = {}
+        for address in addresses:
+            own = LOG_ADDRESS.fullmatch(address)
+            if own is None or int(own[1]) == i:
+                within = attribute_address(own[2] if own else address)
+                local[address] = each_address(within, list_sizes(case))
+        check_distinct(local)
 
 
 def _free_parameter(

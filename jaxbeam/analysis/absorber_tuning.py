@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, suggestion
 from jaxbeam.model.modes import Modes, modes
 from jaxbeam.runtime.arrays import Array, xp
@@ -59,12 +59,13 @@ def tuned_absorber(
     >>> print(f"{absorber.frequency:.3f} Hz, {absorber.damping_ratio:.4f}")
     3.485 Hz, 0.0857
     """
+    check_is_case(case)
     if rule not in RULES:
         raise ValueError(f"rule cannot be {rule!r}; {suggestion(rule, RULES)}")
     check_on_beam("position", position, case.beam.length)
-    if not 1 <= mode <= case.beam.modes:
+    if not isinstance(mode, int) or not 1 <= mode <= case.beam.modes:
         raise ValueError(
-            f"mode must be from 1 to {case.beam.modes}, those of the case; it is {mode}"
+            f"mode must be from 1 to {case.beam.modes}, those of the case; it is {mode!r}"
         )
     if is_concrete(mass) and not concrete(mass) > 0:
         raise ValueError(f"mass must be positive, in kg; it is {mass:g}")

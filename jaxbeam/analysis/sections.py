@@ -21,6 +21,7 @@ from jaxbeam.case.fields import (
     OUTSIDE,
     check_on_beam,
     concrete,
+    real_numbers,
     refuse_traced,
     refuses_traced,
     suggestion,
@@ -61,6 +62,7 @@ def corrected_deflection(record: Record, x, derivative: int = 0) -> Float[Array,
     >>> print(jb.sections.corrected_deflection(jb.simulate(case), 0.3).shape)
     (1001,)
     """
+    x = real_numbers("x", x, "m", "positions")
     return corrected_history(record.case, record.modes, record.motion, x, derivative)
 
 
@@ -102,7 +104,7 @@ def coil_history(
     device = case.actuators[actuator] if actuator < len(case.actuators) else None
     if not isinstance(device, Electrodynamic):
         raise ValueError(f"actuators.{actuator} is no electrodynamic shaker, and has no coil")
-    times = sample_times(case) if times is None else xp.asarray(times, float)
+    times = sample_times(case) if times is None else real_numbers("times", times, "s")
     integration = run_integration(case, integration_plan(case, times, tolerance), times, None)
     motion, model, port = integration.outputs.motion, integration.model, device.coil_port()
     sizes = [one.attachment().state_matrix.shape[0] for one in case.actuators]
@@ -239,7 +241,7 @@ def envelope(
             parts = at(xp.asarray(own[~moving])), at(x[moving])
             order = np.argsort(np.concatenate([own[~moving], own[moving]]), kind="stable")
             return jax.tree.map(lambda *both: xp.concatenate(both)[order], *parts)
-    x = xp.asarray(x, float)
+    x = real_numbers("x", x, "m", "positions")
     check_on_beam("x", x, case.beam.length)
     return at(x)
 
@@ -429,7 +431,7 @@ def influence_table(
         found_at, found = refined(case, at, curves, start)
         positions = np.asarray(found_at)
     else:
-        positions = np.asarray(load_positions, float)
+        positions = np.asarray(real_numbers("load_positions", load_positions, "m", "positions"))
         found = at(positions)
     units = ["N" if q == REACTION else QUANTITIES[q].unit for q, _, _ in lines]
     return InfluenceTable(
@@ -445,6 +447,7 @@ def _sections(case: Case, quantities, x) -> list[tuple[str, str, float]]:
     """Quantity, name of the place and position (m) of each line."""
     points, held = characteristic_points(case), held_positions(case).tolist()
     if x:
+        x = np.atleast_1d(real_numbers("x", x, "m", "positions")).tolist()
         named = {point.x: point.name for point in points}
         given = [(named.get(at, f"{at:g} m"), float(at)) for at in x]
         return [(quantity, *at) for quantity in quantities or ("moment",) for at in given]

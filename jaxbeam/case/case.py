@@ -63,15 +63,28 @@ def each_address(address: str, counts: Mapping[str, int]) -> list[str]:
     return [".".join([key, str(i), *rest[1:]]) for i in range(counts[key])]
 
 
-def overlap(addresses: Iterable[str], counts: Mapping[str, int]) -> str | None:
-    """First address that two of the given addresses both stand for, or None."""
-    seen = set()
-    for address in addresses:
-        for one in each_address(address, counts):
-            if one in seen:
-                return one
-            seen.add(one)
-    return None
+def check_distinct(numbers: Mapping[str, Iterable[str]]) -> None:
+    """Check that no two addresses give one number, as loads.*.speed and loads.0.speed do.
+
+    Nor a list and an entry of it, as beam.damping_ratio and beam.damping_ratio.0. `numbers` has the
+    addresses of those that each stands for. Raises ValueError that names both.
+    """
+    owners: dict[str, str] = {}
+    for address, each in numbers.items():
+        for one in each:
+            if one in owners:
+                raise _given_twice(owners[one], address, one)
+            owners[one] = address
+    for one, address in owners.items():
+        whole = one.rpartition(".")[0]
+        while whole:
+            if whole in owners:
+                raise _given_twice(owners[whole], address, one)
+            whole = whole.rpartition(".")[0]
+
+
+def _given_twice(first: str, second: str, number: str) -> ValueError:
+    return ValueError(f"{first} and {second} both give the number {number}: leave one of them out")
 
 
 class Run(ReprWithUnits):
@@ -385,7 +398,8 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     """A copy of a case with other numbers at some addresses (SI units, or as text with a unit).
 
     `loads.*.speed` sets the speed of all loads. It is differentiable by the values. Raises
-    ValueError for an unknown address, one that some load lacks, or a wrong shape.
+    ValueError for an unknown address, one that some load lacks, two that stand for one number, or
+    a wrong shape.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -395,12 +409,18 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     >>> print(jb.replace(case, {"loads.0.mass": 0.2}).loads[0].mass)
     0.2
     """
+    check_is_case(case)
+    if not isinstance(values, Mapping):
+        raise ValueError(
+            "values map addresses to numbers, as {'loads.0.mass': 0.2}, not"
+            f" {describe_value(values)}"
+        )
     leaves, structure = jax.tree.flatten(case)
     index = {address: i for i, address in enumerate(_addresses_of(structure))}
     numbers = dict(zip(index, leaves, strict=True))
-    each = [
-        (one, value) for key, value in values.items() for one in _own_addresses(case, key, numbers)
-    ]
+    owned = {key: _own_addresses(case, key, numbers) for key in values}
+    check_distinct(owned)
+    each = [(one, values[key]) for key, own in owned.items() for one in own]
     for address, value in each:
         if isinstance(value, str | list | tuple):
             value = in_si(value, unit_at(case, address), address)

@@ -56,6 +56,21 @@ def is_real(value: Any) -> bool:
     return isinstance(value, int | float)
 
 
+def real_numbers(name: str, value: Any, unit: str, what: str = "numbers") -> Any:
+    """A number, or nested lists of them, as a float array; texts as "25 m" are converted.
+
+    `what` says what the argument called `name` holds, in a SI `unit`. Raises ValueError for text
+    without a unit, complex numbers, and whatever else is no number.
+    """
+    converted = in_si(value, unit, name)
+    try:
+        return xp.asarray(np.nan if converted is None else converted, float)
+    except (TypeError, ValueError):
+        pass
+    in_units = "" if unit in ("", "1") else f" in {unit}"
+    raise ValueError(f"{name} takes {what}{in_units}, not {describe_value(value)}")
+
+
 def _has_text(value) -> bool:
     return isinstance(value, str) or any(isinstance(entry, str | list) for entry in value)
 
@@ -338,6 +353,8 @@ def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
 def suggestion(word: str, allowed: Iterable[str]) -> str:
     """End of an error message about an unknown word: the nearest allowed one, or all of them."""
     allowed = list(allowed)
+    if not isinstance(word, str):
+        return f"it may be {', '.join(allowed)}"
     if WORDS.get(word) in allowed:
         return f"it is called {WORDS[word]!r} now"
     kind, options = KINDS.get(word, (None, ""))

@@ -18,6 +18,7 @@ import tomli_w
 
 from jaxbeam.case.case import (
     Case,
+    check_distinct,
     check_is_case,
     each_address,
     list_sizes,
@@ -344,11 +345,10 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     ValueError for an address that no case file could have, and for the errors of `check_case`.
     """
     content, whole = case_to_dict(case), case_to_dict(case, whole=True)
-    each = [
-        (one, value)
-        for address, value in settings.items()
-        for one in each_address(attribute_address(address), list_sizes(case))
-    ]
+    sizes = list_sizes(case)
+    numbers = {one: each_address(attribute_address(one), sizes) for one in settings}
+    check_distinct(numbers)
+    each = [(one, settings[address]) for address, own in numbers.items() for one in own]
     each.sort(key=lambda setting: not setting[0].endswith(".kind"))  # kinds first
     for address, value in each:
         *path, last = address.split(".")

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, describe_value, is_real, refuse_traced
 from jaxbeam.case.toml_file import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history, longest_force_step, max_stable_step
@@ -131,6 +131,10 @@ def check_step_count(count: float, step: float) -> None:
 def check_tolerance(tolerance: float) -> None:
     """Raises ValueError for a tolerance not below 1, below double precision, or traced."""
     refuse_traced("a tolerance", "give a known number", tolerance)
+    if not is_real(tolerance) or np.ndim(tolerance):
+        raise ValueError(
+            f"tolerance takes one number, such as 1e-6, not {describe_value(tolerance)}"
+        )
     if not SMALLEST_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f"tolerance must be at least {SMALLEST_TOLERANCE:g} and below 1, as a fraction of the"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import check_on_beam, concrete, is_concrete
+from jaxbeam.case.fields import check_on_beam, concrete, describe_value, is_concrete, real_numbers
 from jaxbeam.case.sensors import TWIST, TWIST_RATE
 from jaxbeam.case.track import Kernel
 from jaxbeam.case.trajectory import NEVER
@@ -106,7 +106,8 @@ def influence_line(
     >>> print(f"{jb.influence_line(beam, x=1.0, load_positions=1.0):.6f}")  # -L^3 / (48 E I)
     -0.027778
     """
-    x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
+    x = real_numbers("x", x, "m", "positions")
+    load_positions = real_numbers("load_positions", load_positions, "m", "positions")
     layout = validated_layout(case, layout, x=x, positions=load_positions)
     return unchecked_influence_line(case, layout, x, load_positions, derivative)
 
@@ -131,12 +132,12 @@ def static_deflection(
     >>> print(f"{jb.statics.static_deflection(beam, 1.0, load_positions=[1.0], forces=[18.0]):.3f}")
     -0.500
     """
-    positions = xp.atleast_1d(xp.asarray(load_positions, float))
+    positions = xp.atleast_1d(real_numbers("load_positions", load_positions, "m", "positions"))
     if forces is None:
         forces = load_set(case).weight[:, 0]
         described = "wheels of the case"
     else:
-        forces = xp.atleast_1d(xp.asarray(forces, float))
+        forces = xp.atleast_1d(real_numbers("forces", forces, "N"))
         described = "forces"
     if forces.shape != positions.shape or forces.ndim != 1:
         raise ValueError(
@@ -167,7 +168,7 @@ def static_deflection_per_port_force(
 
     In m/N for a force, 1/N for a couple; otherwise as `static_deflection_per_command`.
     """
-    x = xp.asarray(x, float)
+    x = real_numbers("x", x, "m", "positions")
     layout = validated_layout(case, layout, x=x)
     return _deflection_per_port_force(case, layout, x, derivative)
 
@@ -280,6 +281,10 @@ def validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
     Raises ValueError as `influence_line` does.
     """
     check_case(case)
+    if not isinstance(layout, Layout | None):
+        raise ValueError(
+            f"layout takes what mesh_layout(case) returns, or None, not {describe_value(layout)}"
+        )
     for name, position in positions.items():
         check_on_beam(name, position, case.beam.length)
     layout = mesh_layout(case) if layout is None else layout

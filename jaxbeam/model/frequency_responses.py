@@ -35,7 +35,14 @@ from jaxtyping import Complex, Float
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, refuses_traced, suggestion
+from jaxbeam.case.fields import (
+    check_on_beam,
+    concrete,
+    is_concrete,
+    real_numbers,
+    refuses_traced,
+    suggestion,
+)
 from jaxbeam.case.sensors import QUANTITIES, Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -576,7 +583,7 @@ def resonances_and_antiresonances(
 
 
 def _checked_frequencies(frequencies):
-    frequencies = xp.atleast_1d(xp.asarray(frequencies, float))
+    frequencies = xp.atleast_1d(real_numbers("frequencies", frequencies, "Hz"))
     if frequencies.ndim != 1 or not frequencies.size:
         raise ValueError(f"frequencies must be a list of numbers, not of shape {frequencies.shape}")
     if is_concrete(frequencies):
@@ -604,6 +611,6 @@ def checked_masses(case: Case, stationary_masses: StationaryMasses):
 
 
 def _checked_position(case: Case, name: str, x):
-    x = xp.asarray(x, float)
+    x = real_numbers(name, x, "m", "positions")
     check_on_beam(name, x, case.beam.length)
     return x

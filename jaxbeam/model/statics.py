@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, check_is_case
-from jaxbeam.case.fields import check_on_beam, concrete, suggestion
+from jaxbeam.case.fields import check_on_beam, concrete, real_numbers, suggestion
 from jaxbeam.case.sensors import QUANTITIES, SIDES, SLOPE, quantity_of
 from jaxbeam.model.deflection_lines import (
     influence_functions,
@@ -81,7 +81,8 @@ def influence_line(
     check_is_case(case)
     if load_positions is None:
         load_positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
-    x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
+    x = real_numbers("x", x, "m", "positions")
+    load_positions = real_numbers("load_positions", load_positions, "m", "positions")
     kind = _checked_kind(case, x, _Kind(quantity, derivative, side))
     layout = validated_layout(case, layout, x=x, positions=load_positions)
     if quantity == "deflection":
@@ -124,7 +125,7 @@ def static_peak(
     >>> print(f"{jb.statics.static_peak(case, 0.3, quantity='moment'):.3f} N m")  # m g L / 4
     0.736 N m
     """
-    x = xp.asarray(x, float)
+    x = real_numbers("x", x, "m", "positions")
     kind = _checked_kind(case, x, _Kind(quantity, derivative, side))
     parameters = fibre_distance, section_modulus
     if quantity != REACTION:

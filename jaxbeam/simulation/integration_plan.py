@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, real_numbers
 from jaxbeam.case.toml_file import MAX_SAMPLED, MAX_SAMPLES
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -343,7 +343,7 @@ def check_times(times) -> None:
     """Raises ValueError for times (s) that are not finite, ascending, or from the start on."""
     if not is_concrete(times):
         return
-    times = concrete(times)
+    times = concrete(real_numbers("times", times, "s"))
     if times.ndim != 1 or times.size < 2:
         raise ValueError(
             f"times must be at least two numbers in a list; its shape is {times.shape}"

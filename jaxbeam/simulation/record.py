@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete, refuse_traced, refuses_traced
+from jaxbeam.case.fields import concrete, is_concrete, real_numbers, refuse_traced, refuses_traced
 from jaxbeam.case.sensors import QUANTITIES, Sensor
 from jaxbeam.model.along_beam import moving_positions, refined, sections
 from jaxbeam.model.load_set import LoadSet, load_set
@@ -144,7 +144,7 @@ def record_envelope(
         load_places = xp.concatenate(at_extremes, axis=1).T
         positions, _ = moving_positions(case, np.asarray(found.positions), list(load_places))
     if positions is not None:
-        return at(xp.asarray(positions, float))
+        return at(real_numbers("positions", positions, "m", "positions"))
     return refined(case, at, curves)[1]
 
 
@@ -327,6 +327,7 @@ class Record(RecordViews):
         fibre distance, or stress without a section modulus.
         """
         parameters = fibre_distance, section_modulus
+        x = real_numbers("x", x, "m", "positions")
         return section_forces.history(self.case, self.modes, self.motion, x, quantity, *parameters)
 
     def bending_moment(self, x) -> Float[Array, "time ..."]:
@@ -339,6 +340,7 @@ class Record(RecordViews):
         It jumps at loads and supports: by a contact force down, by a reaction up. At the ends of
         the beam it is that within. Raises ValueError for another side.
         """
+        x = real_numbers("x", x, "m", "positions")
         return section_forces.shear_force(self.case, self.modes, self.motion, x, side)
 
     @property

@@ -8,7 +8,8 @@ import equinox as eqx
 import numpy as np
 
 from jaxbeam.case.case import Case, check_is_case, replace
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, real_numbers
+from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.runtime.arrays import Module, any_traced, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
 from jaxbeam.simulation.record import Record
@@ -66,11 +67,12 @@ class Simulator(Module):
                 " values"
             )
         check_is_case(case)
-        times = None if times is None else np.asarray(times, float)
+        times = None if times is None else np.asarray(real_numbers("times", times, "s"))
         ranges = declared_ranges(case, vary)
         timing = [a for a in ranges if times is None and a in ("run.duration", "run.sample_rate")]
         if timing:
             raise ValueError(f"{timing[0]} fixes the number of samples: give times if it varies")
+        check_tolerance(tolerance)
         self.tolerance = float(tolerance)
         plan = varied_plan(case, ranges, times, self.tolerance, plan_of_peaks)
         self.prepared = _Prepared(case, ranges, plan, times)

@@ -14,8 +14,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbeam.case.case import Case, leaves_by_address, own_addresses, replace, value_at
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.case import (
+    Case,
+    check_distinct,
+    leaves_by_address,
+    own_addresses,
+    replace,
+    unit_at,
+    value_at,
+)
+from jaxbeam.case.fields import concrete, is_concrete, real_numbers
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
@@ -71,6 +79,7 @@ def declared_ranges(case: Case, vary) -> dict[str, Range]:
         raise ValueError(
             f"vary lists addresses, such as 'loads.0.mass', or maps each to its range, not {vary!r}"
         )
+    check_distinct({address: own_addresses(case, address) for address in vary})
     given = dict(vary) if isinstance(vary, Mapping) else dict.fromkeys(vary)
     ranges = {}
     for address, both in given.items():
@@ -79,7 +88,11 @@ def declared_ranges(case: Case, vary) -> dict[str, Range]:
             ends = value / MARGIN, value * MARGIN
         else:
             given_ends = both if isinstance(both, list | tuple) or np.ndim(both) else ()
-            ends = tuple(np.broadcast_to(np.asarray(end, float), value.shape) for end in given_ends)
+            unit = unit_at(case, address)
+            ends = tuple(
+                np.broadcast_to(real_numbers(f"the range of {address}", end, unit), value.shape)
+                for end in given_ends
+            )
             if len(ends) != 2 or not np.all(ends[0] <= ends[1]):
                 raise ValueError(f"the range of {address} must be (low, high), not {both}")
         ranges[address] = np.minimum(*ends), np.maximum(*ends)

@@ -18,10 +18,10 @@ from jaxtyping import Float
 from jaxbeam.case.case import (
     Case,
     addresses,
+    check_distinct,
     concrete_case,
     each_address,
     list_sizes,
-    overlap,
     own_addresses,
     replace,
     unit_at,
@@ -307,10 +307,9 @@ def sweep_specification(
                 " and which is not statically corrected, as the beam can move as a rigid body:"
                 " leave it out, or hold the beam"
             )
+    sizes_of_lists = list_sizes(case)
+    check_distinct({one: each_address(attribute_address(one), sizes_of_lists) for one in over})
     over = {attribute_address(address): given for address, given in over.items()}
-    twice = overlap(over, list_sizes(case))
-    if twice:
-        raise ValueError(f"{twice} is swept twice: leave one of {', '.join(over)} out")
     numbers = addresses(case)
     axes = {
         address: _checked_values(case, address, given, numbers) for address, given in over.items()

@@ -29,6 +29,51 @@ def test_it_is_said_that_a_case_is_needed(tmp_path):
     subprocess.run([sys.executable, "-c", SCRIPT], check=True, cwd=tmp_path)
 
 
+WORDS = """
+import jaxbeam as jb
+case = jb.Case(
+    jb.Beam(1.0, 11.68, 0.535), sensors=[jb.Sensor(0.5)],
+    loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+)
+x, places = "x takes positions in m", "load_positions takes positions in m"
+number = "tolerance takes one number"
+asked = [
+    (lambda word: jb.influence_line(case, 0.5, word), places),
+    (lambda word: jb.influence_line(case, word), x),
+    (lambda word: jb.statics.static_peak(case, word), x),
+    (lambda word: jb.statics.static_deflection(case, 0.5, word), places),
+    (lambda word: jb.envelope(case, word), x),
+    (lambda word: jb.sections.influence_table(case, ["moment"], word), x),
+    (lambda word: jb.sections.influence_table(case, ["moment"], None, word), places),
+    (lambda word: jb.frequency_response(case, word), "frequencies takes numbers in Hz"),
+    (lambda word: jb.simulate(case, times=word), "times takes numbers in s"),
+    (lambda word: jb.Simulator(case, times=word), "times takes numbers in s"),
+    (lambda word: jb.Simulator(case, {"loads.0.speed": (1.0, word)}), "the range of loads.0.s"),
+    (lambda word: jb.Simulator(case, tolerance=word), number),
+    (lambda word: jb.simulate(case, tolerance=word), number),
+    (lambda word: jb.sweep(case, {"loads.0.speed": [1.0]}, tolerance=word), number),
+    (lambda word: jb.envelope(case, tolerance=word), number),
+    (lambda word: jb.assess(case, 40.0, classification=word), "classification takes a plain"),
+    (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes what mesh_layout"),
+    (lambda word: jb.sweep(case, word), "over maps addresses to lists"),
+    (lambda word: jb.replace(case, word), "values map addresses to numbers"),
+]
+for ask, message in asked:
+    try:
+        ask("moment")
+    except ValueError as error:
+        assert str(error).startswith(message) and "'moment'" in str(error), (message, error)
+    else:
+        raise AssertionError(message)
+assert jb.influence_line(case, "0.5 m", 0.2) == jb.influence_line(case, 0.5, 0.2)
+"""
+
+
+def test_it_is_said_that_a_word_is_no_number(tmp_path):
+    """Quantities given where positions are expected: it was said that they are no floats."""
+    subprocess.run([sys.executable, "-c", WORDS], check=True, cwd=tmp_path)
+
+
 TUNING = """
 import jaxbeam as jb, tuning
 case, loads = jb.load_case("examples/controlled_rig/case.toml"), {"loads.0.mass": 0.25}

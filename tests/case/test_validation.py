@@ -1,5 +1,6 @@
 """Validation of cases: errors name the address and the remedy, before anything compiles."""
 
+import dataclasses
 import re
 import time
 
@@ -20,7 +21,6 @@ from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import (
     Case,
     Run,
-    overlap,
     own_addresses,
     part_classes,
     replace,
@@ -354,10 +354,29 @@ def test_numbers_that_differ_have_no_common_value():
     assert jb.replace(different, {"loads.*.speed": 1.0}).loads[0].speed == 1.0
 
 
-def test_addresses_that_overlap():
-    sizes = {"loads": 2}
-    assert overlap(["loads.*.speed", "loads.0.mass"], sizes) is None
-    assert overlap(["loads.*.speed", "loads.1.speed"], sizes) == "loads.1.speed"
+TWICE = {
+    "part": (("loads.*.speed", "loads.1.speed"), "loads.1.speed"),
+    "entry": (("beam.damping_ratio", "beam.damping_ratio.1"), "beam.damping_ratio.1"),
+    "entry first": (("beam.damping_ratio.1", "beam.damping_ratio"), "beam.damping_ratio.1"),
+}
+GIVEN_TO = {
+    "replace": lambda case, given: jb.replace(case, dict.fromkeys(given, 0.01)),
+    "settings": lambda case, given: with_settings(case, dict.fromkeys(given, 0.01)),
+    "sweep": lambda case, given: jb.sweep(case, dict.fromkeys(given, [0.01]), progress=False),
+    "Simulator": lambda case, given: jb.Simulator(case, vary=given),
+}
+
+
+@pytest.mark.parametrize("both, number", TWICE.values(), ids=TWICE)
+@pytest.mark.parametrize("take", GIVEN_TO.values(), ids=GIVEN_TO)
+def test_addresses_that_give_one_number_twice(take, both, number):
+    beam = dataclasses.replace(JOINT_CASE.beam, damping_ratio=[0.01, 0.01], modes=2)
+    case = dataclasses.replace(JOINT_CASE, beam=beam, sensors=[jb.Sensor(0.5)])
+    with pytest.raises(ValueError) as refused:
+        take(case, both)
+    message = str(refused.value)
+    assert "both give the number" in message and number in message
+    assert all(address in message for address in both)
 
 
 # Counts of what a case has are limited, and a case beyond a limit is refused at once.

@@ -166,7 +166,7 @@ def test_one_speed_for_all_loads():
             r"2.0e\+05 combinations of words and counts at run.seed",
         ),
         (OVER | {"loads.0.sped": [1.0]}, {}, "with loads.0.train = LM71-axles: the case has no"),
-        ({"loads.0.speed": [1.0], "loads.*.speed": [2.0]}, {}, "loads.0.speed is swept twice"),
+        ({"loads.0.speed": [1.0], "loads.*.speed": [2.0]}, {}, "both give the number loads.0"),
         ({"loads.*.force": [1.0]}, {}, "loads.0 has no force"),
     ],
 )

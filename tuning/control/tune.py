@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import no_bound
-from jaxbeam.case.case import Case, replace
+from jaxbeam.case.case import Case, check_distinct, each_address, list_sizes, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.model.plausibility.check import warn_if_implausible
@@ -192,6 +192,9 @@ class TuningProblem:
         self.case, self.cases, self.objective = case, cases, objective
         self.positions, self.least_peaks, self.penalty = positions, least_peaks, penalty
         self.parameters = free_parameters([case], dict(free), 1.0)
+        sizes = list_sizes(case)
+        for varied in {frozenset(run) for run in (*cases.training, *cases.held_out)}:
+            check_distinct({one: each_address(one, sizes) for one in (*free, *sorted(varied))})
         self.run_set = make_run_set(
             case, cases.training, positions, least_peaks, objective.quantities
         )

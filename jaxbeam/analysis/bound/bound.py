@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.controller import commanded
-from jaxbeam.case.fields import check_on_beam, refuses_traced
+from jaxbeam.case.fields import check_on_beam, real_numbers, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
@@ -630,7 +630,7 @@ def checked_influence(
 def _checked_positions(case: Case, positions) -> Float[np.ndarray, " position"]:
     if positions is None:
         positions = case.sensor_positions
-    positions = np.asarray(positions, float).ravel()
+    positions = np.asarray(real_numbers("positions", positions, "m", "positions")).ravel()
     if positions.size == 0:
         raise ValueError("a bound needs positions: add a sensor, or give positions (m)")
     for i, position in enumerate(positions):

@@ -118,7 +118,11 @@ def test_units_of_all_numbers():
         ({"loads.0.deceleration": None}, "starts at 0, which does not say how large it may be"),
         (
             {"loads.0.mass": None, "logs.1.loads.0.mass": None},
-            "logs.1.loads.0.mass is free twice, as loads.0.mass is free for all logs together",
+            "loads.0.mass and logs.1.loads.0.mass both give the number loads.0.mass",
+        ),
+        (
+            {"logs.1.loads.0.mass": None, "loads.*.mass": None},
+            "logs.1.loads.0.mass and loads.*.mass both give the number loads.0.mass",
         ),
     ],
     ids=lambda value: None if isinstance(value, str) else ",".join(value) or "none",
