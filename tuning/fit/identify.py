@@ -3,22 +3,27 @@
 import contextlib
 import dataclasses
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbeam.case.case import Case, structure_of
+from jaxbeam.case.case import Case, crossing_times, structure_of
 from jaxbeam.case.fields import concrete, refuses_traced
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.progress import BAR_DELAY, ProgressBar, following
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
-from tuning.fit.dataset import Dataset, make_dataset
+from tuning.fit.dataset import Dataset, coloured, make_dataset
 from tuning.fit.least_squares import LeastSquares, SearchPoint, check_loss, multi_start
-from tuning.fit.result import Fit, fit_result
+from tuning.fit.modal_parameters import ModalParameterFit, identify_from_modes
+from tuning.fit.result import CONVERGED, Fit, fit_result
+from tuning.fit.uncertainty import t_quantile
 from tuning.logs.log import Log
-from tuning.parameters import LOG_ADDRESS, FreeParameter, Prior, free_parameters
+from tuning.modal.identify_modes import identify_modes
+from tuning.parameters import LOG_ADDRESS, FreeParameter, Prior, free_parameters, to_unbounded
 
 
 @refuses_traced("a fit")
@@ -45,6 +50,11 @@ def identify(
     bounded Levenberg-Marquardt with exact forward derivatives; noise levels of the
     channels are estimated from the residuals. Standard errors follow from the Jacobian, widened
     where residuals are autocorrelated; directions that are not identifiable are named.
+
+    Where residuals are not white, as on a road that nobody measured, and the modes of the vibration
+    after the loads contradict numbers of the beam, supports or absorbers, those are taken from the
+    modes, with their errors, and the crossings give the loads; `Fit.search` says what the crossings
+    alone gave. Without such vibration, a search that ends badly begins again with the loads.
 
     `loss` "soft-l1" or "huber" reduces the weight of outliers. `stages` are lists of addresses that
     are fitted first, one list after the other, the rest held. With several `starts`, drawn by the
@@ -99,7 +109,99 @@ def identify(
         for mask in stage_masks:
             start = least_squares.solve(dataset.measured, start=start, free=mask).unbounded
         solution = least_squares.solve(dataset.measured, start=start)
-    return fit_result(case, least_squares, solution, minima)
+        fit = fit_result(case, least_squares, solution, minima)
+        if coloured(fit.channel_residuals):
+            fit = _with_decays(fit, bounds) or _loads_first(fit)
+    return fit
+
+
+STRUCTURE = "beam.", "supports.", "absorbers."  # addresses of what free vibration depends on
+MAX_MISFIT = 3.0  # standard deviations (rms) of modes that a case explains
+
+
+def _of_structure(fit: Fit) -> Bool[np.ndarray, " parameter"]:
+    """Mask of the numbers that free vibration depends on."""
+    return np.array([address.startswith(STRUCTURE) for address in fit.addresses])
+
+
+def _with_decays(fit: Fit, bounds: Mapping) -> Fit | None:
+    """Fit whose structure is that of the vibration after the loads, where the two disagree.
+
+    What a crossing misses, as a road that nobody measured, biases damping, stiffness and loads
+    together. The modes of the free decay do not depend on it: they give the numbers of the
+    structure with their errors, and the crossing, from the starts, the others. None without
+    decays, without numbers that modes determine, and with commands.
+    """
+    dataset, of_structure = fit.dataset, _of_structure(fit)
+    driven = any(case.controller is not None for case in dataset.cases)
+    named = [address for address, own in zip(fit.addresses, of_structure, strict=True) if own]
+    # Neither by the starts nor by the fit is a load on the beam later.
+    exits = np.concatenate([crossing_times(case)[:, 1] for case in (*dataset.cases, *fit.cases)])
+    if driven or not of_structure.any() or not exits.size or exits.max() >= NEVER:
+        return None
+    alone = fit.values[of_structure]
+    found = _structure_of_decays(dataset, {a: bounds.get(a) for a in named}, float(exits.max()))
+    if found is None:
+        return None
+    low, high = found.intervals.T
+    if np.all((low <= alone) & (alone <= high)):
+        return None
+    problem = fit.least_squares
+    start = np.array(problem.start_point)
+    start[of_structure] = to_unbounded(found.parameters, found.values)
+    try:
+        solution = problem.solve(dataset.measured, start=start, free=~of_structure)
+    except RuntimeError:  # the loads cannot be found from their starts
+        return None
+    again = fit_result(dataset.nominal_case, problem, solution, fit.minima)
+    errors, correlation = again.errors.copy(), again.correlation.copy()
+    errors[of_structure] = found.errors * found.quantile / t_quantile(again.degrees_of_freedom)
+    correlation[of_structure] = correlation[:, of_structure] = 0.0
+    correlation[np.ix_(of_structure, of_structure)] = found.correlation
+    listed = ", ".join(f"{a} ({v:.4g})" for a, v in zip(named, alone, strict=True))
+    return dataclasses.replace(
+        again,
+        errors=errors,
+        correlation=correlation,
+        search=f"{again.search}; modes of the vibration after the load give the structure, in"
+        f" brackets what the crossing alone gave: {listed}",
+    )
+
+
+def _structure_of_decays(dataset: Dataset, free: Mapping, left: float) -> ModalParameterFit | None:
+    """Numbers of a structure by modes of the vibration after the loads have `left` (s).
+
+    The free decays found in the logs are taken, or else all that is after the loads. None without
+    modes that the case explains and that determine the numbers.
+    """
+    end = min(float(log.times[-1]) for log in dataset.logs)
+    for window in (None, (left, end)):
+        with warnings.catch_warnings(), contextlib.suppress(ValueError):
+            warnings.simplefilter("ignore")  # of the attempt alone
+            decays = identify_modes(dataset.logs, window=window, kind="free decay")
+            if min(begin for begin, _ in decays.windows) >= left:
+                found = identify_from_modes(dataset.nominal_case, decays, free)
+                if np.all(np.isfinite(found.errors)) and found.misfit < MAX_MISFIT:
+                    return found
+    return None
+
+
+def _loads_first(fit: Fit) -> Fit:
+    """Fit begun again with the structure held until the loads are found, if that ends well.
+
+    A fit that ended elsewhere than at a plausible minimum may have begun too far from it.
+    """
+    held = _of_structure(fit)
+    if fit.search == CONVERGED or held.all() or not held.any():
+        return fit
+    problem, measured = fit.least_squares, fit.dataset.measured
+    try:
+        start = problem.solve(measured, free=~held).unbounded
+        solution = problem.solve(measured, start=start)
+    except RuntimeError:
+        return fit
+    again = fit_result(fit.dataset.nominal_case, problem, solution, fit.minima)
+    return again if again.search == CONVERGED else fit
 
 
 @contextlib.contextmanager

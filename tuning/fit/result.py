@@ -43,6 +43,7 @@ MAX_CORRELATION = 0.95  # correlation beyond which two parameters are called har
 PRIOR_DOMINANCE = 0.7  # of the prior's deviation: with a larger error the logs say less than it
 
 NOT_IDENTIFIABLE = "not identifiable"
+CONVERGED = "converged"
 Parameters = Sequence[FreeParameter]
 Values = Float[np.ndarray, " parameter"]
 
@@ -381,7 +382,7 @@ def fit_result(
     pairs = zip(parameters, solution.values, strict=True)
     values = {parameter.address: float(value) for parameter, value in pairs}
     search = (
-        "converged"
+        CONVERGED
         if solution.converged
         else f"has not converged after {MAX_STEPS} steps: start closer"
     )
