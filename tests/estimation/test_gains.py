@@ -1,5 +1,7 @@
 """Gains against python-control and scipy; sampled transitions against scipy."""
 
+import dataclasses
+
 import control
 import jax
 import jax.numpy as jnp
@@ -289,3 +291,30 @@ def test_feedback_of_estimates(kalman, tolerance):
     truth = expected(case, TIMES, NumpyKalman(case, kalman.loads == "estimated"))
     for found, true in ((record.deflection, truth.deflection), (record.command, truth.command)):
         assert_allclose(found, true, rtol=0, atol=tolerance * np.max(np.abs(true)))
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        Kalman(LOOP_FORCE, LOOP_NOISE),
+        jb.MovingHorizon(LOOP_FORCE, LOOP_NOISE, loads="known", deflection_limit=2e-5),
+    ],
+    ids=["kalman", "moving-horizon"],
+)
+def test_loops_in_amplitudes_of_sines_are_those_in_modal_coordinates(estimator):
+    """q = sqrt(m L / 2) a of the amplitude a of a sine, so that gains of a are so many times those.
+
+    The limit of the deflections is met.
+    """
+    gain, records = np.array([[50.0, -80.0, 4.0, 1.5, 0.1]]), []
+    factor = np.append(np.full(4, np.sqrt(0.535 * 0.6 / 2)), 1.0)
+    for coordinates, own in (("modal", gain), ("sine", gain * factor)):
+        case = loop(None, modes=LOOP_MODES)
+        law = jb.StateFeedback(
+            own, coordinates=coordinates, period=LOOP_PERIOD, delay=DELAY, estimator=estimator
+        )
+        records.append(run(dataclasses.replace(case, controller=law)))
+    modal, sine = records
+    assert np.max(np.abs(modal.command)) > 1e-3
+    scale = np.max(np.abs(modal.command))
+    assert_allclose(sine.command, modal.command, rtol=0, atol=1e-7 * scale)

@@ -149,6 +149,26 @@ def test_estimates_are_the_most_probable_within_bounds(window, limit, least):
     assert_allclose((state - expected) / scale, 0.0, atol=2e-4)
 
 
+def test_the_bound_of_the_weight_of_a_vehicle_moves_all_states_with_it():
+    """x + P_w (bound - x_w) / P_ww, of the mean x and covariance P of a Kalman filter."""
+    car = jb.QuarterCar(0.3, 0.1, 400.0, 1.0, 2e3, 0.0, speed=0.5, entry_time=-0.4)
+    case = dataclasses.replace(CASE, loads=(car,))
+    plant = jb.state_space(case)
+    filter = ESTIMATED.sampled_filter(plant, sample_timing(case.controller))
+    state = filter.initial_state()
+    for k, (command, reading) in enumerate(zip(*signals(SAMPLES), strict=True)):
+        measurement = Measurement(reading, np.zeros(5), command)
+        estimate, state = filter.update(state, measurement, np.asarray(k * HORIZON_PERIOD))
+    (weight,) = np.flatnonzero(state.x == estimate.weights)
+    bound = estimate.weights[0] + 1.0
+    column = state.covariance[:, weight] / state.covariance[weight, weight]
+    found = estimates(moving_horizon(min_weight=bound), case)[-1]
+    assert_allclose(found.weights, bound, rtol=1e-7)
+    expected = (state.x + column)[: found.state.size]
+    scale = np.max(np.abs(column[: found.state.size]))
+    assert_allclose(found.state, expected, rtol=1e-6, atol=1e-6 * scale)
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
