@@ -168,6 +168,23 @@ def test_commands_follow_the_identified_load():
     assert_allclose(commands[4:], at_given_mass[:, 0], rtol=1e-7)
 
 
+@pytest.mark.parametrize("speed", [0.8, -0.8])
+def test_mass_from_gates_and_static_readings(speed):
+    """Of a mass at 0.8 m/s (t - 0.2 s) from the end at which it enters; exact from then on."""
+    gates = GATE_IDENTIFICATION.gates if speed > 0 else 0.6 - GATE_IDENTIFICATION.gates
+    settings, model = jb.LoadIdentification(gates), jb.state_space(beam_case(speed=speed))
+    identifier = settings.identifier(model, model)
+    sums, positions = identifier.initial_state(), np.linspace(0.0, 0.6, 201)
+    for t in 0.2 + 0.6 / 0.8 * np.array([-0.02, 0.04, 0.15, 0.25, 0.31]):
+        place = 0.8 * (t - 0.2) if speed > 0 else 0.6 - 0.8 * (t - 0.2)
+        line = [np.interp(place, positions, one) for one in identifier.influence_lines]
+        line = np.array(line) * (0 < place < 0.6)
+        readings = np.array([9.81 * 0.3 * line[0], 7.0, 9.81 * 0.3 * line[1]])
+        found, sums = identifier.update(sums, Measurement(readings, np.zeros(5), np.zeros(1)), t)
+    assert found.mass_identified
+    assert_allclose([found.mass, found.speed, found.entry_time], [0.3, speed, 0.2], rtol=1e-9)
+
+
 def test_speed_and_mass_from_deflections_without_gates():
     """Static readings, with an offset, of a mass that moves to the left at constant speed."""
     settings = jb.LoadIdentification(threshold=1e-6, until=0.4)
