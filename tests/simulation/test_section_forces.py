@@ -94,7 +94,7 @@ def imbalances(record: jb.Record, x, weights) -> np.ndarray:
     """Sums of forces on the beam, and of their moments about x = 0, (2, time).
 
     Reactions, contact forces, support dampers within the reactions, inertia and damping of the
-    modes by quadrature along the beam, patches without commands. Patches add mass.
+    modes by quadrature along the beam, patches without commands. Patches and bearings add mass.
     """
     case, modes = record.case, record.modes
     density = np.full(x.shape, float(case.beam.linear_density))
@@ -107,6 +107,11 @@ def imbalances(record: jb.Record, x, weights) -> np.ndarray:
     position = np.nan_to_num(np.asarray(record.load_position))
     force, reactions = np.asarray(record.contact_force), np.asarray(record.reactions)
     held_at = np.asarray(record.support_positions)
+    for support in case.supports:
+        if support.mass is not None:
+            mass, x = float(support.mass), np.append(x, support.position)
+            bearing = mass * np.asarray(record.at(x[-1:], "acceleration"))
+            inertia = np.hstack([inertia, bearing])
     sums = reactions.sum(axis=1) - force.sum(axis=1) - inertia.sum(axis=1)
     moments = reactions @ held_at - np.sum(force * position, axis=1) - inertia @ x
     return np.array([sums, moments])
@@ -129,6 +134,8 @@ CASES = {
             jb.Support(2.0, stiffness=1e11),
         ],
     ),
+    "pulled": jb.Case(dataclasses.replace(BEAM, axial_force=3.0), supports=[jb.Support(0.9)]),
+    "heavy bearing": jb.Case(BEAM, supports=[jb.Support(0.8, stiffness=80.0, mass=0.3)]),
     "patch": jb.Case(
         BEAM, actuators=[jb.Patch(0.5, 0.9, 1e-3, added_mass=0.1, added_rigidity=0.5)]
     ),

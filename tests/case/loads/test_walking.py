@@ -156,12 +156,13 @@ def test_force_histories_begin_with_a_step_at_its_time(activity, step_time):
 
 
 def test_paces_of_a_crowd_end_at_three_deviations(monkeypatch):
-    """Draws of the standard normal distribution beyond it are rare: some are given."""
-    draws = np.zeros(6), np.zeros(6), np.array([-5.0, -3.5, -1.0, 2.9, 3.5, 9.0])
+    """Draws of the standard normal distribution beyond it are rare: some are given, and places."""
+    draws = np.linspace(0, 1, 6), np.zeros(6), np.array([-5.0, -3.5, -1.0, 2.9, 3.5, 9.0])
     monkeypatch.setattr(jb.Crowd, "_draws", lambda _: draws)
     crowd = jb.Crowd(people=6, length=9.0, pace=1.9, pace_deviation=0.1, speed=1.4)
     paces = [one.frequencies[0] for one in crowd.force_histories().values()]
     assert_allclose(paces, [1.6, 1.6, 1.8, 2.19, 2.2, 2.2], rtol=1e-12)
+    assert_allclose(crowd.vehicle(9.81).offsets, [0.0, 1.8, 3.6, 5.4, 7.2, 9.0], rtol=1e-12)
 
 
 # Line loads against closed forms and integrals of influence lines.

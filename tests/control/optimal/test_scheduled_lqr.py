@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Estimate, Measurement
+from jaxbeam.case.controller import Estimate, EstimatedLoads, Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.crossing_gains import GainSchedule, PositionGainLaw
 from jaxbeam.control.load_identification import identified_load
@@ -90,6 +90,12 @@ def test_commands_are_interpolated_between_designs():
     assert_allclose(
         commands(nearest, shares, 0.26, 1.6)[:2], single_designs[0.2, 2.0][:2], rtol=1e-9
     )
+
+
+def test_the_weight_of_a_load_beyond_the_designs_is_that_of_the_nearest():
+    law = LQR(**WEIGHTS, masses=[0.2, 0.4], horizon="crossing", schedule="load", augmented="loads")
+    beyond, heaviest = (commands(law, [0.3, 0.6, 0.9], mass, 2.0) for mass in (0.5, 0.4))
+    assert_allclose(beyond, heaviest, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("fade", "left"), [(None, 1.0), (0.5, np.exp(-2.0))])
@@ -373,6 +379,29 @@ def test_before_the_entry_and_after_the_exit():
     sizes = np.array([0.3, 0.2]) + np.maximum(exit_speeds, 1.0)
     expected = np.array([0.3, 0.2]) @ (5.0 * sizes * np.exp(-gone / 0.05)) / 0.5
     assert_allclose(law.step((), x, REST, jnp.asarray(0.6)).command, -expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("t", [0.23, 0.42])
+def test_loads_that_go_left_are_read_by_their_way_from_the_right(t):
+    """Those of the case, and those of an estimate at the same places."""
+    x = np.array([0.7, -0.4])
+    left = [dataclasses.replace(load, speed=-load.speed) for load in (BRAKING, SECOND)]
+    law, time = polynomial_law(left), jnp.asarray(t)
+    positions, speeds, _ = law.load_set.kinematics(np.asarray(t))
+    followed = EstimatedLoads(law.load_masses, positions, speeds)
+    for estimate in (Estimate(jnp.asarray(x)), Estimate(jnp.asarray(x), loads=followed)):
+        command = law.step((), estimate, REST, time).command
+        assert_allclose(command, expected_command((BRAKING, SECOND), x, t), rtol=1e-9)
+
+
+def test_estimated_loads_that_have_left_fade_from_their_exits():
+    """They left at their speeds: at 0.04 m and 0.1 m beyond the end 0.02 s and 0.04 s ago."""
+    masses, speeds = np.array([0.3, 0.2]), np.array([2.0, 2.5])
+    followed = EstimatedLoads(masses, LENGTH + np.array([0.04, 0.1]), speeds)
+    law, estimate = polynomial_law((BRAKING, SECOND)), Estimate(jnp.array([1.0, 0.0]))
+    found = law.step((), estimate._replace(loads=followed), REST, jnp.asarray(0.5)).command
+    fading = np.exp(-np.array([0.02, 0.04]) / 0.05)
+    assert_allclose(found, -masses @ (5.0 * (masses + speeds) * fading) / 0.5, rtol=1e-9)
 
 
 def regulators():

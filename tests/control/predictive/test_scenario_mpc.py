@@ -8,7 +8,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.controller import Measurement
+from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
 from tests.control.predictive.test_mpc_exact import affine, by_clarabel
 
@@ -74,6 +74,22 @@ def test_factors_are_those_of_cases():
     of_case = jb.MPC(**varying, nominal_plant=jb.state_space(case))
     factors = jb.ScenarioMPC(**varying, mass_factors=[0.5], stiffness_factors=[1.3])
     assert_allclose(commands_of(factors), commands_of(of_case), rtol=0, atol=1e-7)
+
+
+def test_estimated_weights_count_by_their_factors():
+    """A single scenario of half the masses is predictive control with half the weight."""
+    varying = BASE | {"loads": "known"}
+    found = []
+    for controller, weight in (
+        (jb.ScenarioMPC(**varying, mass_factors=[0.5]), 4.0),
+        (jb.MPC(**varying), 2.0),
+    ):
+        law = controller.law(jb.state_space(scenario_case(controller))).law
+        measurement = Measurement(np.zeros(1), STATES[0], np.zeros(1))
+        estimate = Estimate(STATES[0], np.array([weight]))
+        found.append(law.step(law.initial_state(), estimate, measurement, np.asarray(0.1)).command)
+    assert_allclose(*found, rtol=0, atol=1e-9)
+    assert abs(found[0]) > 0.1
 
 
 class Futures:

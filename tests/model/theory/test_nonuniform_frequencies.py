@@ -135,6 +135,19 @@ def test_rotary_inertia_alone():
     assert_allclose(found, k**2 / np.sqrt(1 + 0.01 * k**2), rtol=1e-12)
 
 
+def test_bearing_mass():
+    """A mass on a spring at the free end of a clamped beam: Rayleigh's equation of the tip."""
+    spring, mass = 20.0, 0.7
+    found = frequencies(
+        [jb.Support(1.0, stiffness=spring, mass=mass)], **UNIT, ends="clamped-free", modes=4
+    )
+    k = np.sqrt(found)
+    stiffness = (1 + np.cosh(k) * np.cos(k)) * k**3
+    tip = np.cosh(k) * np.sin(k) - np.sinh(k) * np.cos(k)
+    residual = (stiffness + (spring - mass * k**4) * tip) / (k**3 * np.cosh(k))
+    assert_allclose(residual, 0, atol=1e-9)
+
+
 def test_a_stiff_and_a_soft_half():
     """Eight modes, most in the soft half: roots of the exact transfer matrix of both."""
     halves = jb.Segment(0.5, 1.0, 1.0), jb.Segment(0.5, 1e-2, 1.0)

@@ -54,6 +54,9 @@ def test_optimum_equals_that_of_scipy():
     solution = scipy.optimize.least_squares(residuals, plain.start_values, x_scale=[20, 0.03, 0.2],
                                          xtol=1e-12, ftol=1e-14, gtol=1e-12)  # fmt: skip
     np.testing.assert_allclose(plain.values, solution.x, rtol=1e-6)
+    # Noise without bias: by the number of samples less that of parameters.
+    freedom = solution.fun.size - solution.x.size
+    np.testing.assert_allclose(np.sum(solution.fun**2) / freedom, 1.0, rtol=1e-5)
     errors = np.sqrt(np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
     np.testing.assert_allclose(
         plain.errors, errors, rtol=0.15
