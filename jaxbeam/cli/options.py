@@ -25,7 +25,7 @@ from jaxbeam.cli.arguments import (
     parse_size,
     parse_value,
 )
-from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.output_file import refuse_folder, whole_file
 from jaxbeam.runtime.printer import text_table
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class OutputOptions(PrintOptions):
         """Check, before any work, that files can be written; `others` are further ways out.
 
         Raises FileNotFoundError if the folder does not exist, FileExistsError if the file exists
-        and `--overwrite` is not given.
+        and `--overwrite` is not given, or is a folder.
         """
         for path in filter(None, paths):
             if not path.parent.is_dir():
@@ -96,6 +96,7 @@ class OutputOptions(PrintOptions):
             if path.exists() and not self.overwrite:
                 ways = f"choose another name or add {others}--overwrite"
                 raise FileExistsError(f"{path} exists; {ways}")
+            refuse_folder(path, path)
 
 
 @Parameter(name="*")

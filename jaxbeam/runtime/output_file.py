@@ -31,9 +31,10 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
     """Path at which to write the file or folder that takes the place of `path` at the end.
 
     A write that is stopped leaves what was there. Raises FileExistsError if something is there,
-    without `overwrite`; OSError (a FileNotFoundError without its folder) with the name `path`,
-    whatever cannot be written, or is a device or a pipe, which a file would take the place of;
-    ValueError for an empty name, which is that of the folder.
+    without `overwrite`, or a folder, which is replaced by a folder only if it is a store of Zarr;
+    OSError (a FileNotFoundError without its folder) with the name `path`, whatever cannot be
+    written, or is a device or a pipe, which a file would take the place of; ValueError for an
+    empty name, which is that of the folder.
     """
     check_named(path)
     place = Path(os.path.realpath(path))  # a link stays a link
@@ -49,6 +50,7 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
             yield partial
             _refuse_existing(place, path, overwrite)  # of another process meanwhile
             if place.is_dir():
+                refuse_folder(place, path, by_file=partial.is_file())
                 shutil.rmtree(place)
             os.replace(partial, place)
     finally:
@@ -89,6 +91,20 @@ def _refuse_existing(place: Path, path: str | os.PathLike, overwrite: bool) -> N
         raise FileExistsError(
             f"{os.fspath(path)} exists already; choose another name, or overwrite it"
         )
+    refuse_folder(place, path)
+
+
+def refuse_folder(place: Path, path: str | os.PathLike, by_file: bool = False) -> None:
+    """Raises FileExistsError for a folder in whose place nothing is written: it may hold anything.
+
+    A store of Zarr and an empty folder may be replaced, but not `by_file`. `place` is `path`, with
+    links followed.
+    """
+    if not place.is_dir():
+        return
+    is_store = any((place / name).is_file() for name in ("zarr.json", ".zgroup"))
+    if by_file or not (is_store or next(place.iterdir(), None) is None):
+        raise FileExistsError(f"{os.fspath(path)} is a folder, not a file; choose another name")
 
 
 SIGN_OF_LIFE = 10.0  # s, between two signs of life

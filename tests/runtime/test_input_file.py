@@ -303,12 +303,27 @@ def test_what_is_there_is_refused_before_and_after(tmp_path):
 def test_a_folder_takes_the_place_of_a_folder_and_links_stay(tmp_path):
     place, link = tmp_path / "runs.zarr", tmp_path / "link.zarr"
     place.mkdir()
-    (place / "old").touch()
+    (place / "zarr.json").touch()
     link.symlink_to(place)
     with whole_file(link, overwrite=True) as partial:
         partial.mkdir()
         (partial / "new").touch()
     assert link.is_symlink() and [path.name for path in place.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize("name", ["runs.nc", "runs.zarr"])
+def test_no_folder_of_others_is_replaced(tmp_path, name):
+    """`--overwrite` deleted a folder, with all in it, that had the name of the file to write."""
+    place = tmp_path / name
+    place.mkdir()
+    (place / "notes.txt").write_text("precious")
+    refused = pytest.raises(FileExistsError, match=rf"{name} is a folder, not a file; choose")
+    with refused, whole_file(place, overwrite=True):
+        pytest.fail("nothing is computed")
+    (place / "zarr.json").touch()  # a store, which no file replaces
+    with refused, whole_file(place, overwrite=True) as partial:
+        partial.touch()
+    assert (place / "notes.txt").read_text() == "precious" and list(tmp_path.iterdir()) == [place]
 
 
 def test_a_link_to_a_file_without_an_ending_keeps_both(tmp_path):
