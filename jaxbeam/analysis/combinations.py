@@ -23,7 +23,7 @@ from jaxbeam.analysis.load_models import (
 )
 from jaxbeam.analysis.sections import envelope
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, refuses_traced, suggestion
+from jaxbeam.case.fields import concrete, is_real, refuses_traced, suggestion
 from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.model.along_beam import sections
 from jaxbeam.model.statics import REACTION
@@ -91,7 +91,7 @@ def combined(
                 raise ValueError(
                     f"{where}: there is no such action; {suggestion(action, extremes)}"
                 )
-            values = np.atleast_1d(np.asarray(given, float))
+            values = np.atleast_1d(np.asarray(given if is_real(given) else np.nan, float))
             if values.ndim != 1 or values.size not in (1, 2) or not np.isfinite(values).all():
                 raise ValueError(f"{where} is a factor, or two, as [1.35, 1.0], not {given!r}")
             products = values[:, None, None] * np.stack(extremes[action])

@@ -31,6 +31,7 @@ def test_it_is_said_that_a_case_is_needed(tmp_path):
 
 WORDS = """
 import jaxbeam as jb
+from jaxbeam.analysis.combinations import combine
 case = jb.Case(
     jb.Beam(1.0, 11.68, 0.535), sensors=[jb.Sensor(0.5)],
     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
@@ -54,6 +55,10 @@ asked = [
     (lambda word: jb.sweep(case, {"loads.0.speed": [1.0]}, tolerance=word), number),
     (lambda word: jb.envelope(case, tolerance=word), number),
     (lambda word: jb.assess(case, 40.0, classification=word), "classification takes a plain"),
+    (
+        lambda word: combine(case, {"a": {"uniform": 1.0}}, {"c": {"a": word}}, [0.5]),
+        "combinations.c.a is a factor, or two",
+    ),
     (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes what mesh_layout"),
     (lambda word: jb.sweep(case, word), "over maps addresses to lists"),
     (lambda word: jb.replace(case, word), "values map addresses to numbers"),

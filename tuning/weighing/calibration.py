@@ -29,7 +29,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
-from tuning.logs.pairing import sensor_readings
+from tuning.logs.pairing import check_loads, sensor_readings
 from tuning.weighing.axle_fit import DYNAMIC_LIMITS, CrossingLog, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, model_influence_lines
 
@@ -54,7 +54,8 @@ def calibrate_influence_lines(case: Case, logs: Log | Sequence[Log]) -> Influenc
     by noise and by dynamic wheel forces, which only runs at other speeds average out. Loads are
     those of each log, or else of the case.
 
-    Raises ValueError if no load is known, and for a sensor of velocity or acceleration.
+    Raises ValueError if no load is known or has crossed within a log, and for a sensor of velocity
+    or acceleration.
 
     >>> import numpy as np
     >>> import jaxbeam as jb
@@ -155,6 +156,7 @@ class _Run:
                 f"{log.source}: no load is known; calibration needs a vehicle of known wheel loads,"
                 " in the case or in the TOML file beside the log"
             )
+        check_loads(log, dataclasses.replace(case, loads=loads))
         crossing = CrossingLog(log.times, *sensor_readings(case, log))
         self.times, self.readings, self.valid = crossing.times, crossing.readings, crossing.valid
         self.vehicles = [_vehicle(case, load, self.times) for load in loads]

@@ -238,3 +238,6 @@ def test_what_cannot_be_weighed(crossings):
         weigh_axles(felt, log, SPEEDS, 2)
     with pytest.raises(ValueError, match="no load is known; calibration needs a vehicle of known"):
         calibrate_influence_lines(case(), log)
+    slow = dataclasses.replace(case(), loads=[jb.MovingForce(force=1.0, speed=1e-3)])
+    with pytest.raises(ValueError, match="before the first load has crossed at"):
+        calibrate_influence_lines(slow, log)
