@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, real_numbers
 from jaxbeam.runtime.arrays import Array, not_differentiated, xp
 from jaxbeam.simulation.record import Record
 
@@ -85,7 +85,8 @@ def weighted_acceleration(
     """Vertical accelerations (m/s^2) after the filters W_k of ISO 2631-1, which start at rest.
 
     The signal between samples is the one without content above half of their rate. Raises
-    ValueError for times (s) that are not equally spaced, or less than 160 a second.
+    ValueError for times (s) that are not equally spaced, or less than 160 a second, or not as many
+    as the accelerations.
 
     >>> import numpy as np
     >>> import jaxbeam as jb
@@ -94,8 +95,7 @@ def weighted_acceleration(
     >>> print(jb.ride.weighted_acceleration(times, shaking).shape)
     (8000,)
     """
-    step = _time_step(times, WEIGHTED_BAND)
-    acceleration = xp.asarray(acceleration)
+    step, acceleration = _step_and_signal(times, acceleration, WEIGHTED_BAND)
     count = acceleration.shape[0]
     padded = count + int(np.ceil(MEMORY / step))  # the end of the record does not reach its start
     response = vertical_weighting(np.fft.rfftfreq(padded, step))
@@ -155,7 +155,8 @@ def sperling_index(
 
     from 0.5 to 30 Hz, with the one-sided density G of the acceleration in (cm/s^2)^2/Hz, or the
     amplitudes a_f of its Fourier series: 4.42 times the weighted rms (m/s^2) to the power 0.3.
-    Raises ValueError for times (s) that are not equally spaced, or less than 60 a second.
+    Raises ValueError for times (s) that are not equally spaced, or less than 60 a second, or not as
+    many as the accelerations.
 
     >>> import numpy as np
     >>> import jaxbeam as jb
@@ -165,8 +166,7 @@ def sperling_index(
     4.12
     """
     low, high = SPERLING_BAND
-    step = _time_step(times, high)
-    acceleration = xp.asarray(acceleration)
+    step, acceleration = _step_and_signal(times, acceleration, high)
     count = acceleration.shape[0]
     frequency = np.fft.rfftfreq(count, step)
     in_band = (frequency >= low) & (frequency <= high)
@@ -256,16 +256,23 @@ def ride_measures(record: Record) -> RideMeasures:
     )
 
 
-def _time_step(times, highest_frequency: float) -> float:
-    """Spacing (s) of concrete times that resolve frequencies up to the highest one (Hz)."""
+def _step_and_signal(times, acceleration, highest_frequency: float):
+    """Spacing (s) of concrete times that resolve frequencies up to the highest one, and signal."""
+    times = real_numbers("times", times, "s")
+    acceleration = real_numbers("acceleration", acceleration, "m/s^2")
+    if times.ndim != 1 or acceleration.shape[:1] != times.shape:
+        raise ValueError(
+            "acceleration must be (time, ...), one for each of the times (time,); their shapes are"
+            f" {acceleration.shape} and {times.shape}"
+        )
     if not is_concrete(times):
         raise ValueError(f"times of ride measures {UNKNOWN}, not traced ones")
     not_differentiated(times, f"times of ride measures {UNKNOWN}: there are no derivatives by them")
     steps = np.diff(np.asarray(concrete(times), float))
-    if steps.size == 0 or np.ptp(steps) > 1e-6 * np.max(np.abs(steps)):
+    if steps.size == 0 or steps[0] <= 0 or np.ptp(steps) > 1e-6 * np.max(np.abs(steps)):
         raise ValueError(
-            "times must be equally spaced for ride measures; simulate with run.sample_rate and"
-            " without a list of times"
+            "times must ascend and be equally spaced for ride measures; simulate with"
+            " run.sample_rate and without a list of times"
         )
     rate, needed = 1 / np.mean(steps), 2 * highest_frequency
     if rate < needed * (1 - 1e-9):
@@ -273,4 +280,4 @@ def _time_step(times, highest_frequency: float) -> float:
             f"times must be at least {needed:g} a second for vibration up to"
             f" {highest_frequency:g} Hz; there are {rate:g}: give a larger run.sample_rate"
         )
-    return float(np.mean(steps))
+    return float(np.mean(steps)), acceleration

@@ -185,8 +185,9 @@ def test_known_and_traced_histories_give_the_same():
 
 
 def test_bad_times_are_refused():
-    with pytest.raises(ValueError, match="must be equally spaced"):
-        jb.ride.weighted_rms(np.array([0.0, 0.001, 0.003]), np.zeros(3))
+    for times in ([0.0, 0.001, 0.003], [0.002, 0.001, 0.0]):
+        with pytest.raises(ValueError, match="must ascend and be equally spaced"):
+            jb.ride.weighted_rms(np.array(times), np.zeros(3))
     with pytest.raises(ValueError, match="at least 160 a second .* there are 100: give a larger"):
         jb.ride.vibration_dose(np.arange(9) / 100, np.zeros(9))
     with pytest.raises(ValueError, match="at least 60 a second"):

@@ -59,6 +59,8 @@ asked = [
         lambda word: combine(case, {"a": {"uniform": 1.0}}, {"c": {"a": word}}, [0.5]),
         "combinations.c.a is a factor, or two",
     ),
+    (lambda word: jb.ride.weighted_rms(word, [1.0]), "times takes numbers in s"),
+    (lambda word: jb.ride.sperling_index([0.0], word), "acceleration takes numbers in m/s^2"),
     (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes what mesh_layout"),
     (lambda word: jb.sweep(case, word), "over maps addresses to lists"),
     (lambda word: jb.replace(case, word), "values map addresses to numbers"),
@@ -70,6 +72,13 @@ for ask, message in asked:
         assert str(error).startswith(message) and "'moment'" in str(error), (message, error)
     else:
         raise AssertionError(message)
+for measure in (jb.ride.weighted_rms, jb.ride.sperling_index):
+    try:  # the index of fewer accelerations than times was that of another duration
+        measure([0.0, 0.005, 0.01, 0.015], [0.0, 0.1, 0.0])
+    except ValueError as error:
+        assert "one for each of the times" in str(error), error
+    else:
+        raise AssertionError(measure)
 assert jb.influence_line(case, "0.5 m", 0.2) == jb.influence_line(case, 0.5, 0.2)
 """
 
