@@ -179,6 +179,24 @@ def test_estimate_without_noise_is_the_state(crossing):
     assert_allclose(record.command, truth.command, rtol=0, atol=1e-5 * size)
 
 
+@pytest.mark.parametrize("lag", [1.5e-3, 5e-4])
+def test_delayed_accelerations_have_the_command_of_their_time(lag):
+    """Sampled before and after the command changes, 1 ms into each period of 2 ms."""
+    sensors = jb.Sensor(0.15), jb.Sensor(0.45, "acceleration", delay=lag)
+    law = jb.LQR([3e4, 3e4, 1.0, 1.0], [0.01], period=2e-3, delay=1e-3)
+    case = dataclasses.replace(
+        CASE, actuators=(jb.PointForce(0.4),), sensors=sensors, controller=law, run=jb.Run(0.1)
+    )
+    loads = (jb.MovingMass(mass=0.4, speed=0.5, entry_time=0.0),)
+    estimator = Kalman(FORCES, np.array([1e-5, 1e-3]), loads="known")
+    truth = simulated(dataclasses.replace(case, loads=loads))
+    law = dataclasses.replace(law, estimator=estimator)
+    record = simulated(dataclasses.replace(case, loads=loads, controller=law))
+    size = np.max(np.abs(truth.command))
+    assert size > 1e-3
+    assert_allclose(record.command, truth.command, rtol=0, atol=1e-5 * size)
+
+
 def test_gain_of_the_time_invariant_filter_is_the_limit():
     """Limit of the gain of the crossing filter while no load is on the beam."""
     sensors = (SENSORS[0], SENSORS[1], dataclasses.replace(SENSORS[2], filter=None))

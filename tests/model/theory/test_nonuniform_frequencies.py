@@ -135,6 +135,20 @@ def test_rotary_inertia_alone():
     assert_allclose(found, k**2 / np.sqrt(1 + 0.01 * k**2), rtol=1e-12)
 
 
+def test_a_spring_in_a_hinge():
+    """Of two cantilevers that meet: symmetric modes have no shear there, and M = -2 k w'."""
+    spring, half = 3.0, 0.5
+    hinge = jb.Hinge(0.5, rotational_stiffness=spring)
+    found = frequencies(**UNIT, ends="clamped-clamped", modes=4, hinges=[hinge])
+    b = np.sqrt(found[[0, 2]])
+    # w = cosh bx - cos bx - a (sinh bx - sin bx) of half the beam
+    a = (np.sinh(b * half) - np.sin(b * half)) / (np.cosh(b * half) + np.cos(b * half))
+    curvature = np.cosh(b * half) + np.cos(b * half) - a * (np.sinh(b * half) + np.sin(b * half))
+    slope = np.sinh(b * half) + np.sin(b * half) - a * (np.cosh(b * half) - np.cos(b * half))
+    assert_allclose((b * curvature + 2 * spring * slope) / (b * np.cosh(b * half)), 0.0, atol=1e-9)
+    assert_allclose(found[[1, 3]], np.array([3.926602312047919, 7.068582745628732]) ** 2 / half**2)
+
+
 def test_bearing_mass():
     """A mass on a spring at the free end of a clamped beam: Rayleigh's equation of the tip."""
     spring, mass = 20.0, 0.7
