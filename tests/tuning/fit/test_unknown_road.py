@@ -1,6 +1,7 @@
 """Fits to crossings of a suspended vehicle over a road that the model does not have."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 import tuning
 
+DEMO = Path(jb.__file__).parent / "demo"
 TRUTH = jb.Case(
     jb.Beam(25.0, 1.2e10, 9000.0, damping_ratio=0.012, modes=4),
     sensors=[
@@ -81,3 +83,11 @@ def test_known_roads_leave_the_fit_as_it_is():
     level = dataclasses.replace(TRUTH, profile=None)
     fit = tuning.identify(level, crossing(1, road=None), dict.fromkeys(STRUCTURE), progress=False)
     assert fit.search == "converged" and fit.verdict.startswith("the model explains the logs")
+
+
+def test_modes_of_a_wrong_structure_are_not_taken():
+    """The spring of the shaker is 20 % too stiff: modes would give 15.5 for 11.68 N m^2."""
+    case, log = jb.load_case(DEMO / "rig.toml"), tuning.read_log(DEMO / "log_1.csv")
+    fit = tuning.identify(case, log, ["beam.flexural_rigidity"], progress=False)
+    assert fit.verdict.startswith("the model misses something") and fit.search == "converged"
+    assert_allclose(fit.values, 11.68, rtol=0.07)
