@@ -221,7 +221,7 @@ def test_table_has_the_gains_of_the_design():
 def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
     """Between masses of the grid, along the crossing, and during the decay after it."""
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3], "after": "fade", "fade_time": 0.05}
-    family = {"masses": [0.2, 0.4], "between": between, "loads": "known"}
+    family = {"masses": [0.2, 0.4], "between": between, "augmented": "loads"}
     controller = LQR(**WEIGHTS, **end, **family, points=210, horizon="crossing", schedule="load")
     case = jb.replace(shaker_case(controller), {"loads.0.mass": 0.25})
     write_gains(export_gains(case, 11), tmp_path / "gains.csv")
