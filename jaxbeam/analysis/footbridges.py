@@ -29,6 +29,7 @@ DENSITIES = {"TC2": 0.2, "TC3": 0.5, "TC4": 1.0, "TC5": 1.5}  # people/m^2 of tr
 COMFORT = {"CL1": 0.5, "CL2": 1.0, "CL3": 2.5}  # m/s^2, largest vertical acceleration of a class
 FORCE = 280.0  # N, first harmonic of a person: 0.4 of 700 N
 # Of the first five harmonics, 0.4, 0.1, 0.042, 0.041 and 0.027 of the weight, over the first.
+# The one open text of the clause has 0.42 for the third, above the first: taken for 0.042.
 HARMONICS = 1.0, 0.25, 0.105, 0.1025, 0.0675
 DENSE = 1.0  # people/m^2: density from which on paces are no longer free
 POINTS = 2001  # along the beam, of the integral of a shape

@@ -193,8 +193,19 @@ def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
 
 
 def file_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """New array in a file, so that it may be larger than the memory."""
-    return np.memmap(path, dtype, "w+", shape=shape)
+    """New array in a file, so that it may be larger than the memory.
+
+    Raises OSError on a full disk: written to without its space, the file would end the process.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    if not size:
+        return np.empty(shape, dtype)
+    with open(path, "wb") as opened:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(opened.fileno(), 0, size)
+        else:
+            opened.truncate(size)
+    return np.memmap(path, dtype, "r+", shape=shape)
 
 
 def _of_any_length(values: np.ndarray) -> np.ndarray:
@@ -334,11 +345,15 @@ class ZarrStore(BlockStore):
         return self._intact(range(blocks))
 
     def empty(self, name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        return file_array(self._folder / f"{name}{ROWS_FILE}", shape, dtype)
+        with explaining_write_errors(self._path):
+            return file_array(self._folder / f"{name}{ROWS_FILE}", shape, dtype)
 
     def collect(self, blocks, index):
-        with explaining_damage(self._path):
+        try:
             return super().collect(blocks, index)
+        except ValueError as error:
+            with explaining_damage(self._path):
+                raise error from None
 
     def finish(self, dataset: xarray.Dataset) -> None:
         replace_blocks(self._path, dataset)

@@ -1,6 +1,8 @@
 """Blocks of sweeps are sized by memory: what they take, and the same results whatever they take."""
 
 import dataclasses
+import errno
+import os
 import tracemalloc
 
 import numpy as np
@@ -191,3 +193,16 @@ def test_stored_histories_are_those_in_memory(tmp_path, seeds):
     options = {"over": seeds | SPEEDS, "histories": True, "progress": False}
     found = jb.sweep(case, store=tmp_path / "runs.zarr", **options)
     xarray.testing.assert_equal(found, jb.sweep(case, **options))
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="space cannot be reserved here")
+def test_collecting_onto_a_full_disk_keeps_the_blocks(tmp_path, monkeypatch):
+    store = create_store(tmp_path / "runs.zarr", "a" * 64, {}, np.ones(1))
+    store.write(0, {"deflection": np.ones((1, 2, 5, 1))})
+
+    def full(*given):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match="finished blocks are kept: mend this, then resume"):
+        store.collect(1, np.array([[0, 1]]))
