@@ -349,6 +349,7 @@ class ZarrStore(BlockStore):
             return file_array(self._folder / f"{name}{ROWS_FILE}", shape, dtype)
 
     def collect(self, blocks, index):
+        """As `BlockStore.collect` does. Raises ValueError that says how to mend the store."""
         try:
             return super().collect(blocks, index)
         except ValueError as error:
