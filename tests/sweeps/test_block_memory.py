@@ -11,7 +11,6 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import computation
 from jaxbeam.sweeps.blocks import SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, LEAST_BYTES, PHASE
@@ -68,9 +67,8 @@ def test_forces_take_no_more_memory_than_counted(beam, quantity, count, duration
     assert_allclose(small._peaks(runs, PHASE).peak_deflection, found.peak_deflection, rtol=1e-12)
 
 
+@pytest.mark.usefixtures("c_integrator")
 def test_sensors_in_groups_have_the_same_peaks():
-    if not native_peaks.available():
-        native_peaks.LIBRARY.build()
     case = dataclasses.replace(
         case_of(UNIFORM, jb.MovingMass(mass=2e3, speed=50.0), "moment", 1),
         sensors=[jb.Sensor(20.0, "moment"), jb.Sensor(12.0), jb.Sensor(3.0, "shear")],

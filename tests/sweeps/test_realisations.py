@@ -8,7 +8,6 @@ import pytest
 import scipy
 
 import jaxbeam as jb
-from jaxbeam.integrator import native_peaks
 from jaxbeam.plot import plot_realisations
 from jaxbeam.sweeps import sweep as sweeps
 from jaxbeam.sweeps.realisations import (
@@ -98,21 +97,12 @@ ROUGH = jb.Case(
 )
 
 
-@pytest.fixture(scope="module")
-def c_library(tmp_path_factory):
-    """The C integrator in a cache folder of these tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        native_peaks.LIBRARY.build()
-        yield
-
-
 def relative_difference(first, second) -> float:
     names = "peak_deflection", "peak_moment"
     return max(float(np.nanmax(np.abs(first[name] / second[name] - 1))) for name in names)
 
 
-def test_seeds_as_runs_of_a_batch_and_one_by_one(c_library, monkeypatch):
+def test_seeds_as_runs_of_a_batch_and_one_by_one(c_integrator, monkeypatch):
     """Profiles of their own in C, with vehicles that all share, against a sweep of each seed."""
     over = {"profile.seed": range(1, 11), "loads.0.speed": [18.0, 23.0]}
     together = jb.sweep(ROUGH, over, progress=False)
@@ -126,7 +116,7 @@ def test_seeds_as_runs_of_a_batch_and_one_by_one(c_library, monkeypatch):
     assert found.cases.values.tolist() == alone.cases.values.tolist()
 
 
-def test_stated_errors_of_twenty_profiles(c_library):
+def test_stated_errors_of_twenty_profiles(c_integrator):
     """Against a tenth of the tolerance: all together, and each with its own statement."""
     seeds, speed = range(20), {"loads.0.speed": [22.0]}
     exact = jb.sweep(ROUGH, {"profile.seed": seeds} | speed, tolerance=1e-8, progress=False)

@@ -48,13 +48,7 @@ RANDOM_RUNS = st.lists(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _c_library(tmp_path_factory):
-    """The C integrator in a cache folder of these tests, if there is a compiler."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        native_peaks.LIBRARY.build()
-        yield
+pytestmark = pytest.mark.usefixtures("c_integrator")
 
 
 @contextlib.contextmanager
