@@ -11,7 +11,7 @@ import numpy as np
 from jaxbeam.runtime.input_file import check_input
 
 CODECS = ("bytes", "vlen-utf8", "zstd")
-DATA_TYPES = ("bool", "uint8", "int32", "int64", "float32", "float64", "string")
+DATA_TYPES = ("bool", "int8", "uint8", "int32", "int64", "float32", "float64", "string")
 OTHER_FORMATS = (".zarray", ".zgroup", ".zattrs", ".zmetadata")  # files of zarr of format 2
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+import zarr
 
 import jaxbeam as jb
 from jaxbeam.simulation.stored_record import read_record
@@ -292,6 +293,24 @@ def test_stores_with_codecs_that_run_code_are_refused(copy, tmp_path, place):
         with pytest.raises(ValueError, match=r"is damaged \(jaxbeam writes no \.zarray"):
             sweep(copy, resume=True)
     assert not trace.exists()
+
+
+def test_booleans_as_older_xarray_writes_them(copy, complete):
+    """Versions before 2026 write int8 with the attribute `dtype = "bool"`."""
+    group = zarr.open_group(copy)
+    before = group["failed"]
+    assert isinstance(before, zarr.Array)
+    values, names = np.asarray(before[...], np.int8), before.metadata.dimension_names
+    group.create_array(
+        "failed",
+        data=values,
+        attributes={**before.attrs, "dtype": "bool"},
+        dimension_names=names,
+        overwrite=True,
+        config={"write_empty_chunks": True},
+    )
+    assert '"int8"' in (copy / "failed" / "zarr.json").read_text()
+    xarray.testing.assert_identical(sweep(copy, resume=True).failed, complete[1].failed)
 
 
 # Libraries go through one file, which verifies the HMAC of what it reads; nothing is unpickled.
