@@ -5,10 +5,12 @@ import contextvars
 import errno
 import functools
 import gc
+import inspect
 import os
+import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from cyclopts import (
@@ -83,6 +85,21 @@ RENAMED_OPTIONS = {  # by command, in its new word
 
 WRONG_USAGE = 2
 
+
+def _documented(command: Callable) -> Callable:
+    """The command, its docstring without "Raises", each paragraph in a line: terminals wrap it."""
+    lines: list[str] = []
+    text = re.sub(r"\s*\bRaises [^.]*\.", "", inspect.cleandoc(command.__doc__ or ""))
+    for line in text.splitlines():
+        indents = [re.match(r" *[^\s-]", one) for one in (line, *lines[-1:])]
+        if len(indents) == 2 and all(indents) and len({one.end() for one in indents if one}) == 1:
+            lines[-1] += f" {line.strip()}"
+        else:
+            lines.append(line)
+    command.__doc__ = "\n".join(lines)
+    return command
+
+
 app = App(
     name="jaxbeam",
     help="Beams under moving loads: simulation, control and identification from logs.",
@@ -94,9 +111,9 @@ app = App(
 for _title, _commands in COMMANDS.items():
     _group = Group.create_ordered(_title)
     for _command in _commands:
-        app.command(_command, group=_group)
-app["weigh"].command(calibrate)
-app["weigh"].command(traffic)
+        app.command(_documented(_command), group=_group)
+for _command in (calibrate, traffic):
+    app["weigh"].command(_documented(_command))
 app.register_install_completion_command(
     help="Install completion of commands and options for bash, zsh, fish or PowerShell, also in"
     " the file that the shell reads when it starts."

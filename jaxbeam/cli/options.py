@@ -79,29 +79,7 @@ class PrintOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class OutputOptions(PrintOptions):
-    """Options of a command that writes files."""
-
-    overwrite: Annotated[bool, Parameter("--overwrite", help="Replace existing files.")] = False
-
-    def check_outputs(self, *paths: Path | None, others: str = "") -> None:
-        """Check, before any work, that files can be written; `others` are further ways out.
-
-        Raises FileNotFoundError if the folder does not exist, FileExistsError if the file exists
-        and `--overwrite` is not given, or is a folder.
-        """
-        for path in filter(None, paths):
-            if not path.parent.is_dir():
-                raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
-            if path.exists() and not self.overwrite:
-                ways = f"choose another name or add {others}--overwrite"
-                raise FileExistsError(f"{path} exists; {ways}")
-            refuse_folder(path, path)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class CaseOptions(OutputOptions):
+class ReadingOptions(PrintOptions):
     """Options of a command that reads a case."""
 
     set_: Annotated[
@@ -143,6 +121,34 @@ class CaseOptions(OutputOptions):
         if judged:
             print_warnings(jb.check(case if judged == "case" else structure_of(case)))
         return case
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class OutputOptions(PrintOptions):
+    """Options of a command that writes files."""
+
+    overwrite: Annotated[bool, Parameter("--overwrite", help="Replace existing files.")] = False
+
+    def check_outputs(self, *paths: Path | None, others: str = "") -> None:
+        """Check, before any work, that files can be written; `others` are further ways out.
+
+        Raises FileNotFoundError if the folder does not exist, FileExistsError if the file exists
+        and `--overwrite` is not given, or is a folder.
+        """
+        for path in filter(None, paths):
+            if not path.parent.is_dir():
+                raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to")
+            if path.exists() and not self.overwrite:
+                ways = f"choose another name or add {others}--overwrite"
+                raise FileExistsError(f"{path} exists; {ways}")
+            refuse_folder(path, path)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class CaseOptions(OutputOptions, ReadingOptions):
+    """Options of a command that reads a case and writes files."""
 
 
 @Parameter(name="*")

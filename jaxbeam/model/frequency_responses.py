@@ -45,6 +45,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.sensors import QUANTITIES, Sensor
 from jaxbeam.case.validation import check_case
+from jaxbeam.model.elements import held_positions
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.model.output_rows import row_on_states, sensor_rows
@@ -95,8 +96,8 @@ def shaker_channels(index: int) -> tuple[tuple[str, str], ...]:
 def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
     """Default pairs (input, output): each command with each sensor, and `shaker_channels`.
 
-    Without commands, a force at each sensor and that sensor. Raises ValueError if a case has
-    neither.
+    Without commands, a force at each sensor and that sensor; the force stands at the middle of the
+    longest span for a sensor on a rigid support. Raises ValueError if a case has neither.
     """
     pairs = []
     for i, actuator in enumerate(case.actuators):
@@ -105,7 +106,7 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
         if isinstance(actuator, Electrodynamic):
             pairs += shaker_channels(i)
     if not pairs:
-        positions = [float(sensor.position) for sensor in case.sensors]
+        positions = [_force_position(case, float(sensor.position)) for sensor in case.sensors]
         pairs = [(f"force@{x:g}", f"sensors.{j}") for j, x in enumerate(positions)]
     if not pairs:
         raise ValueError(
@@ -113,6 +114,18 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
             " force@0.3 and deflection@0.3"
         )
     return tuple(pairs)
+
+
+def _force_position(case: Case, x: float) -> float:
+    """Position (m) of the force for a sensor at x m: the same, but on no rigid support."""
+    length, held = float(concrete(case.beam.length)), held_positions(case)
+    elastic = [float(concrete(s.position)) for s in case.supports if s.stiffness is not None]
+    rigid = np.setdiff1d(held, elastic)
+    if not np.any(np.abs(rigid - x) < 1e-9 * length):
+        return x
+    marks = np.unique([0.0, *held, length])
+    longest = np.argmax(np.diff(marks))
+    return float(np.mean(marks[longest : longest + 2]))
 
 
 def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair, ...]:

@@ -452,3 +452,21 @@ def test_the_command_scores_a_controller(run, folder):
     expected = jb.benchmark.score("unknown_mass", law, seed=1)
     assert_allclose(found["score"], expected.mean, rtol=1e-9)
     assert found["runs"][0]["seed"] == 1
+
+
+HELP = {
+    "monitor": "temperatures and other conditions, and a control chart of the residuals",
+    "benchmark": "0 % without control; no controller exceeds 100 %.\n",
+    "sweep": "at the fastest of the speeds, 1 % of it is left at the bridge.",
+}
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_terminals_wrap_the_help(command, capsys, monkeypatch):
+    """Not the source does; which errors Python raises is no matter of a command line."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    printed = capsys.readouterr().out
+    assert HELP[command] in printed
+    assert "Raises" not in printed

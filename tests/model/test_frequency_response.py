@@ -314,6 +314,17 @@ def test_default_pairs_without_actuators_are_forces_at_the_sensors():
     assert_allclose(found[0], receptance(case, 7.0, 0.25, 0.25)[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("support", "place"), [(jb.Support(0.2), "0.4"), (jb.Support(0.2, stiffness=1e5), "0.2")]
+)
+def test_default_forces_are_not_on_rigid_supports(support, place):
+    """A force on a rigid support moves nothing: that for a sensor there is in the longest span."""
+    beam, sensor = jb.Beam(0.6, 11.68, 0.535), jb.Sensor(0.2, quantity="moment")
+    case = jb.Case(beam, [support], sensors=[sensor, jb.Sensor(0.0, quantity="slope")])
+    assert common_pairs(case) == ((f"force@{place}", "sensors.0"), ("force@0.4", "sensors.1"))
+    assert np.all(frequency_response(case, [7.0]).magnitude > 1e-6)
+
+
 INVALID = [
     ({"frequencies": [-1.0]}, "frequencies must be finite and not negative, in Hz; found -1"),
     ({"frequencies": [np.nan]}, "found nan"),

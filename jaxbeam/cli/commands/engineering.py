@@ -9,7 +9,14 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import check_suffix, refuse_option
-from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
+from jaxbeam.cli.options import (
+    CaseOptions,
+    Output,
+    PictureOptions,
+    ReadingOptions,
+    print_warnings,
+    table,
+)
 from jaxbeam.files.endings import TABLES
 
 ZERO = 1e-5  # fraction of the largest value of a quantity that is printed as 0
@@ -350,7 +357,7 @@ def _value_and_place(found, values, index) -> tuple[str, str]:
     return f"{values[index]:.6g}", f"{found.positions[index]:.6g}"
 
 
-def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
+def check(case: Path, /, *, options: ReadingOptions = ReadingOptions()) -> None:
     """Check a case without running it: errors, and warnings of what looks wrong, as units.
 
     Parameters

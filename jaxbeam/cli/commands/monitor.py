@@ -61,7 +61,7 @@ def monitor(
     order
         Highest order of the models of the stabilisation diagram.
     processes
-        Number of logs that are analysed at once; by default that of the processor's cores.
+        Number of logs that are analysed at once; by default the number of processor cores.
     store
         FILE.json: modes of the logs so far; FOLDER.modes.json beside the call by default.
     plot

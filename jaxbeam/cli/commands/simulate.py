@@ -131,7 +131,10 @@ def _absorber_lines(record: "jb.Record") -> list[str]:
 
 
 def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
-    """Labels of the wheels at which one of the values is largest, with the names of these."""
+    """Labels of the wheels at which one of the values is largest, with the names of these.
+
+    Without names if one wheel has all of them.
+    """
     import numpy as np
 
     wheels, words = np.array(list(labels)), {"unloading": "most unloaded"}
@@ -143,6 +146,8 @@ def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
             found.setdefault(wheel, []).append(words.get(name, f"{name} force"))
     return {
         wheel: f"{labels[wheel]}, {' and '.join(names)} of {wheels.size}"
+        if len(found) > 1
+        else f"{labels[wheel]} of {wheels.size}"
         for wheel, names in found.items()
     }
 
