@@ -63,8 +63,8 @@ def test_commands_are_accepted(capsys, line):
 
 def captions() -> list[str]:
     """Commands below the pictures of the gallery that are stored with the site."""
-    found = re.findall(r"^`(jaxbeam [^`]+)`", TEXT["docs/gallery.md"], re.M)
-    return [" ".join(command.split()) for command in found]
+    found = re.findall(r"^```console\n(jaxbeam .+?)\n```", TEXT["docs/gallery.md"], re.M | re.S)
+    return [" ".join(command.replace("\\\n", " ").split()) for command in found]
 
 
 @pytest.mark.parametrize("command", captions())
