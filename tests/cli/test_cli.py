@@ -309,6 +309,7 @@ def test_assess_cites_clauses(run, refused, folder):
 def test_influence_lines_as_a_table(run, refused, folder):
     printed = run("influence case.toml -o lines.csv --plot")
     assert "moment at midspan 1" in printed and (folder / "lines.png").exists()
+    assert "e-1" not in printed  # round-off of a load over a support
     heads, *rows = (folder / "lines.csv").read_text().splitlines()
     assert heads.split(",")[1] == "moment at midspan 1 (m)"
     assert max(float(row.split(",")[1]) for row in rows) == pytest.approx(0.6 / 4)

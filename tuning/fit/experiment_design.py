@@ -58,7 +58,12 @@ class ExperimentDesign:
         rows = zip(self.choices, self.units, self.before, self.after, strict=True)
         lines = [f"{choice}: {a:.5g} -> {b:.5g} {unit}" for choice, unit, a, b in rows]
         errors = zip(self.addresses, self.errors_before, self.errors_after, strict=True)
-        lines += [f"standard error of {name}: {a:.3g} -> {b:.3g}" for name, a, b in errors]
+        lines += [
+            f"standard error of {name}: {a:.3g} -> {b:.3g}"
+            if np.isfinite(b)
+            else f"{name} is not identifiable: no reading depends on it alone"
+            for name, a, b in errors
+        ]
         return "\n".join(lines)
 
 

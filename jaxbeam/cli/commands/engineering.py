@@ -178,12 +178,12 @@ def envelope(
                 columns[head].append(entry)
             for head, entry in zip(dynamic, of_crossing[i] or (math.nan, math.nan), strict=True):
                 dynamic[head].append(float(entry))
-            of_rounding = ZERO * max(-found.lowest.min(), found.highest.max())
-            low, high = (0.0 if abs(one) < of_rounding else one for one in (low, high))
-            extremes = [f"{low:.5g}", str(found.at_lowest[i]) if low else ""]
-            extremes += [f"{high:.5g}", str(found.at_highest[i]) if high else ""]
+            largest = max(-found.lowest.min(), found.highest.max())
+            low, high, *moving = (_text(one, largest) for one in (low, high, *of_crossing[i]))
+            extremes = [low, str(found.at_lowest[i]) if low != "0" else ""]
+            extremes += [high, str(found.at_highest[i]) if high != "0" else ""]
             if velocity is not None:
-                extremes += [f"{one:.5g}" for one in of_crossing[i]] or ["", ""]
+                extremes += moving or ["", ""]
             rows.append((f"{name} at {label or f'{place:g} m'}", *extremes))
     if velocity is not None:
         columns |= dynamic
@@ -254,7 +254,8 @@ def combine(
                 entry[f"highest {combination}"] = float(high[k, i])
             for head, value in entry.items():
                 columns.setdefault(head, []).append(value)
-            extremes = f"{low[worst[0], i]:.5g}", f"{high[worst[1], i]:.5g}"
+            largest = max(-low.min(), high.max())
+            extremes = (_text(one, largest) for one in (low[worst[0], i], high[worst[1], i]))
             by = (found.names[k] for k in worst)
             pairs = (text for pair in zip(extremes, by, strict=True) for text in pair)
             rows.append((f"{name} at {label or f'{place:g} m'}", *pairs))
@@ -354,7 +355,12 @@ def influence(
 
 
 def _value_and_place(found, values, index) -> tuple[str, str]:
-    return f"{values[index]:.6g}", f"{found.positions[index]:.6g}"
+    return _text(values[index], abs(values).max(), 6), f"{found.positions[index]:.6g}"
+
+
+def _text(value, largest, digits: int = 5) -> str:
+    """A value of a quantity with so many digits, or 0 if it is round-off of the largest."""
+    return "0" if abs(value) < ZERO * largest else f"{value:.{digits}g}"
 
 
 def check(case: Path, /, *, options: ReadingOptions = ReadingOptions()) -> None:

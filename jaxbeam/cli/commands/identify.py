@@ -40,7 +40,7 @@ def identify(
     mask: tuple[str, ...] = (),
     profile: tuple[str, ...] = (),
     draws: int = 0,
-    noise: str = "held",
+    noise: str = "fixed",
     validate: bool = False,
     report: Path | None = None,
     output: Output = None,
@@ -78,7 +78,7 @@ def identify(
     draws
         Number of draws from the posterior in each of four chains (extra bayes).
     noise
-        Noise levels of the draws: held at those of the fit, or estimated with each draw.
+        Noise levels of the draws: fixed at those of the fit, or estimated with each draw.
     validate
         Predict each log from a fit to the others (cross-validation).
     report

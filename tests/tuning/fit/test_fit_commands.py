@@ -1,5 +1,6 @@
 """Command lines around fits: calls of the library, output, and refusals."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -117,14 +118,16 @@ def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
 
 
 def test_design_of_an_experiment(call, monkeypatch):
-    arguments = {}
+    arguments, found = {}, []
 
     def design_experiment(case, free, over, **settings):
         arguments.update(free=free, over=over, settings=settings)
-        return ExperimentDesign(
+        design = ExperimentDesign(
             ["sensors.0.position"], ["m"], np.array([0.1]), np.array([0.3]), ["beam.length"],
             np.array([2.0]), np.array([1.0]), np.ones((1, 1)), case,
         )  # fmt: skip
+        found.append(design)
+        return design
 
     monkeypatch.setattr(tuning, "design_experiment", design_experiment)
     vary = "--vary sensors.0.position=0.1:0.5"
@@ -136,6 +139,9 @@ def test_design_of_an_experiment(call, monkeypatch):
     assert "standard error of beam.length: 2 -> 1" in out and "written: better.toml" in out
     result = json.loads(call(f"{line} --json")[1])
     assert result["standard_errors"]["beam.length"] == {"before": 2.0, "after": 1.0}
+    unseen = {"errors_before": np.array([np.inf]), "errors_after": np.array([np.inf])}
+    design = dataclasses.replace(found[0], **unseen)
+    assert "beam.length is not identifiable" in str(design)
     without_choice = call("design-experiment case.toml --free beam.length")[2]
     assert "name what can be chosen with --vary" in without_choice
     assert "--vary takes ADDRESS=VALUE" in call(f"{line} --vary loads.0.speed")[2]
@@ -233,10 +239,11 @@ def test_json(call, monkeypatch):
     monkeypatch.setattr(tuning, "identify", lambda *given, **settings: stand_in.fit())
     code, out, _ = call(
         "identify case.toml runs.csv --free beam.length --mask missing --json"
-        " --profile sensors.0.offset --validate"
+        " --profile sensors.0.offset --validate --draws 4"
     )
     result = json.loads(out)
     assert code == 0 and len(result["left_out"]) == 3
+    assert len(result["posterior"]) > 1
     low, high = result["profiles"]["sensors.0.offset"]["interval"]
     assert low < 0.2 < high
     assert set(result["numbers"]) == set(stand_in.TRUTH)
