@@ -111,7 +111,7 @@ class ProgramText(NamedTuple):
 
 
 BY_PRECISION = """
-#define BY_PRECISION(single, twice) (sizeof(real) < 8 ? (real)(single) : (real)(twice))
+#define BY_PRECISION(single, twice) (sizeof(real) < 8 ? (single) : (twice))
 """
 
 # Of commands, relative to the largest, in double and single precision. Rounding makes ROUNDING and
@@ -170,7 +170,7 @@ void {name}_step({name}_state *s, const {name}_real *measurements, {name}_real t
 def source_text(name: str, title: list[str], code: ProgramText) -> str:
     """Text of the source: constants, helper functions, reset, gate and step."""
     constants = [
-        _wrapped(f"static const {_type(values)} {constant}[] = {{{array_text(values)}}};")
+        _wrapped(f"static const {_type(values)} {constant}[] = {{{real_text(values)}}};")
         for constant, values in code.constants.items()
     ]
     unused = [f"    (void){word};" for word in ("measurements", "t") if not uses(code.body, word)]
@@ -178,9 +178,9 @@ def source_text(name: str, title: list[str], code: ProgramText) -> str:
 #include "{name}.h"
 
 #include <limits.h>
-#include <math.h>
 #include <stdlib.h>
 #include <string.h>
+#include <tgmath.h>
 
 #ifdef __FAST_MATH__
 #error "missing readings are NaN, which -ffast-math takes for numbers: compile without it"
@@ -293,7 +293,7 @@ int main(void)
 
 def _cost_lines(code: ProgramText) -> list[str]:
     return [
-        f"Written by jaxbeam {version('jaxbeam')}; C99, fixed memory, no library but math.h.",
+        f"Written by jaxbeam {version('jaxbeam')}; C99, fixed memory, no library but that of math.",
         f"Cost of a step at worst: {code.operations} additions, multiplications, divisions,",
         "comparisons and functions of math.h.",
         f"Memory in double precision: {code.state_bytes} bytes of state,"
@@ -354,7 +354,7 @@ def _reset_lines(code: ProgramText) -> list[str]:
     """C statements that set the state to its initial values."""
     lines, loops = [], False
     for name, part in code.members.items():
-        values = array_text(part.start).split(", ")
+        values = real_text(part.start).split(", ")
         if len(values) > 2 and len(set(values)) == 1:
             loops = True
             lines.append(f"    for (i = 0; i < {len(values)}; i++) s->{name}[i] = {values[0]};")
@@ -380,6 +380,11 @@ def array_text(values: Num[np.ndarray, "*entry"] | Bool[np.ndarray, "*entry"]) -
     """Numbers of an array in C, separated by commas; exact in double precision."""
     kind = int if values.dtype.kind in "iub" else float
     return ", ".join(map(number_text, np.ravel(values).astype(kind).tolist()))
+
+
+def real_text(values: Num[np.ndarray, "*entry"] | Bool[np.ndarray, "*entry"]) -> str:
+    """Numbers of an array in C, in the precision of the program, separated by commas."""
+    return in_single_type(array_text(values))
 
 
 def _comment(lines: list[str]) -> str:
@@ -511,7 +516,7 @@ def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
     renew(writer, kept, after, None)
     writer.line("/* Commands */")
     writer.copy(CArray("d", (actuators,), "commands", False), sent)
-    body = in_single_type("\n".join(writer.lines))
+    body = "\n".join(writer.lines)
     notes = []
     if jax.tree.structure(program.law.law) != jax.tree.structure(law):
         notes = [f"Tables over time end after {samples} samples; then their last entries hold."]

@@ -30,6 +30,7 @@ from jaxbeam.runtime.interpreter import called_program
 from jaxbeam.runtime.native_library import C_FOLDER
 
 WIDTH = 100  # of the lines of C
+NUMBERS = re.compile(r"(?<![\w.])(?:\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+|NAN\b|INFINITY\b)")
 INDEX = "#"  # placeholder of the index in the text of an `Expression`
 QUADRATIC_PROGRAMS = "numerics/qp"  # whose tolerances depend on the precision
 PACKAGE = str(Path(__file__).parents[1])
@@ -98,10 +99,10 @@ class ProgramWriter(Translation):
         self.stack_bytes = 0
 
     def line(self, text: str) -> None:
-        """Write a line, or several of at most WIDTH characters."""
+        """Write a line, or several of at most WIDTH characters, with the types of a program."""
         indent = "    " * self.depth
         self.lines += textwrap.wrap(
-            text,
+            in_single_type(text),
             WIDTH,
             initial_indent=indent,
             subsequent_indent=f"{indent}    ",
@@ -257,8 +258,8 @@ def _plain(function: str) -> str:
 
 
 def in_single_type(text: str) -> str:
-    """Text of translated lines with the types of a program: `real` and `int`, not float."""
-    text = re.sub(r"\b(NAN|INFINITY)\b", r"(real)\1", text)  # which are float in C
+    """Text of translated lines with the types of a program, `real` and `int`, also of numbers."""
+    text = NUMBERS.sub(r"(real)\g<0>", text)  # which are float or double in C
     for word, own in (("double", "real"), ("int64_t", "int"), ("INT64_", "INT_")):
         text = re.sub(rf"\b{word}\b" if word != "INT64_" else word, own, text)
     return text
@@ -305,7 +306,7 @@ SMALL = [
     "static int within(int index, int most)\n{\n"
     "    return index < 0 ? 0 : index > most ? most : index;\n}",
     "static int whole(real x)\n{\n"
-    "    return x >= 2e9 ? 2000000000 : x > -2e9 ? (int)x : -2000000000;\n}",
+    "    return x >= (real)2e9 ? 2000000000 : x > -(real)2e9 ? (int)x : -2000000000;\n}",
 ]
 
 

@@ -57,7 +57,12 @@ def test_program_gives_the_commands_of_the_loop(kind, tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_program_in_single_precision(kind, tmp_path):
-    error, state_bytes = checked(kind, tmp_path, "-DLAW_REAL=float", "-O0")  # it is run once
+    """To its rounding; nothing is computed in double precision, so that no library of it is needed.
+
+    The compilers warn of each number that is converted.
+    """
+    in_single = ["-DLAW_REAL=float", "-Wdouble-promotion", "-Wfloat-conversion"]
+    error, state_bytes = checked(kind, tmp_path, *in_single, "-O0")  # it is run once
     assert 0 < error < SINGLE_ROUNDING
     assert state_bytes <= exported(kind).state_bytes
 

@@ -54,7 +54,9 @@ def test_header_states_cost_and_meaning(program):
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 def test_check_finds_a_wrong_constant(program, tmp_path):
-    source, changes = re.subn(r"(values_0\[\] = \{0.0, 5.0)", r"\g<1>2", program.files["gates.c"])
+    source, changes = re.subn(
+        r"(values_0\[\] = \{\(real\)0.0, \(real\)5.0)", r"\g<1>2", program.files["gates.c"]
+    )
     assert changes == 1
     write_c(program._replace(files=program.files | {"gates.c": source}), tmp_path)
     assert COMPILER is not None

@@ -14,7 +14,6 @@ from jaxbeam.c_code.program import BY_PRECISION, array_text
 from jaxbeam.c_code.translation import (
     ProgramWriter,
     functions_of,
-    in_single_type,
     named_arrays,
     operations,
     without_unused,
@@ -63,7 +62,7 @@ def found_by_c(function, inputs: np.ndarray, folder) -> np.ndarray:
         found = writer.converted(value, "d")
         writer.copy(CArray("d", found.shape, f"(y + {place})", False), found)
         place += found.size
-    body = in_single_type("\n".join(writer.lines))
+    body = "\n".join(writer.lines)
     constants = (
         f"static const {'real' if values.dtype.kind == 'f' else 'int'} {name}[] ="
         f" {{{array_text(values)}}};"
