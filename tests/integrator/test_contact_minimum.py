@@ -39,7 +39,7 @@ def minimum(force, lowest=np.inf):
     [
         (lambda t: 1.0 + (t - 1.37) ** 2, 1.0, NEVER),
         (lambda t: (t - 2.41) ** 2 - 0.0625, -0.0625, 2.16),
-        (lambda t: 3.0 - t, 0.0, NEVER),  # at the end of the last step
+        (lambda t: 3.0 + 1e-13 - t, 0.0, NEVER),  # least at the end of the last step
         (lambda t: t - 0.1, -0.1, 0.0),  # at the start of the first
         (lambda t: (t - 1.1) ** 2 - 1e-6, -1e-6, 1.099),  # pulls between two fractions only
         (lambda t: (1.3 - t) * (t**4 + 1.0), -139.4, 1.3),  # not straight between fractions
