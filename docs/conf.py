@@ -34,7 +34,14 @@ suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]
 # Notebooks are executed by the tests (`.ci/run`); the site shows the outputs that they have then.
 smartquotes = False  # quotes in commands are to be copied
 nb_execution_mode = "off"
-myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = [
+    "amsmath",
+    "attrs_block",
+    "attrs_inline",
+    "colon_fence",
+    "deflist",
+    "dollarmath",
+]
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

@@ -153,14 +153,18 @@ def default(key: Key) -> str:
 
 def key_table(part_class: type) -> list[str]:
     """Table of the keys of a table of a case file, in Markdown."""
-    lines = ["| key | meaning | value | unit | default | bounds |", "|---|---|---|---|---|---|"]
+    lines = [
+        "{.keys}",
+        "| key | meaning | value | unit | default | bounds |",
+        "|---|---|---|---|---|---|",
+    ]
     for key in table_keys(part_class):
         unit = "" if key.unit in ("", "1") else key.unit
         value = "one number" if key.is_number and key.values == "one number" else key.values
         value = "a word" if key.words else value
         cells = [f"`{key.name}`", key.meaning, value, unit, default(key), bounds(key)]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return lines if len(lines) > 2 else ["It has no keys."]
+    return lines if len(lines) > 3 else ["It has no keys."]
 
 
 def prose(part_class: type) -> list[str]:
@@ -262,7 +266,8 @@ def command(name: str) -> list[str]:
         text = argument.parameter.help or documented.get(attribute, "")
         text = " ".join(text.split()).replace("|", "\\|").replace("*", r"\*").replace("<", r"\<")
         default = argument.field_info.default
-        if isinstance(default, int | float | str) and not isinstance(default, bool) and default:
+        said = isinstance(default, bool) or "if left out" in text
+        if isinstance(default, int | float | str) and default and not said:
             text += f" Default: {default}."
         lines.append(f"| {', '.join(f'`{n}`' for n in names)} | {text} |")
     return [*lines, ""]
