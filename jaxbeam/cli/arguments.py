@@ -75,8 +75,8 @@ def named_numbers(
 def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str]]:
     """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,..., numbers or all words.
 
-    Raises UsageError for numbers among words, if a range has too many numbers, or if an address is
-    named twice.
+    Raises UsageError for numbers among words, if a range has too many numbers or is one of MATLAB,
+    or if an address is named twice.
     """
     values = {}
     for text in texts:
@@ -95,21 +95,28 @@ def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str
 
 
 def _range_values(text: str, value: str) -> list[Any]:
-    start, *rest = value.split(":")
-    if len(rest) == 2 and is_quantity(start):
-        return _quantity_range(text, start, *rest)
+    first, *rest = value.split(":")
+    if len(rest) == 2 and is_quantity(first):
+        return _quantity_range(text, first, *rest)
     limits = _parse_numbers("--over", text, value.split(":"))
     if len(limits) != 3 or not (limits[2] >= 1 and limits[2] % 1 == 0):
         raise UsageError(
             f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
         )
+    start, stop, count = limits
+    if 0 < stop < start < count:
+        raise UsageError(
+            f"--over {text}: a range is START:STOP:COUNT, not START:STEP:STOP: in steps of {stop:g}"
+            f" write {start:g}:{count:g}:{(count - start) // stop + 1:g}, and {count:g} values"
+            f" downwards as {stop:g}:{start:g}:{count:g}"
+        )
     import numpy as np
 
     from jaxbeam.sweeps import MAX_VALUES
 
-    if limits[2] > MAX_VALUES:
+    if count > MAX_VALUES:
         raise UsageError(f"--over {text}: a range may have {MAX_VALUES:.0e} values, no more")
-    return np.linspace(limits[0], limits[1], int(limits[2])).tolist()
+    return np.linspace(start, stop, int(count)).tolist()
 
 
 def _quantity_range(text: str, start: str, stop: str, count: str) -> list[str]:

@@ -66,6 +66,10 @@ def draw_forces(axes, record: Record) -> None:
             for i, wheel in enumerate(wheels):
                 shade = tinted(tint, 1 - 0.7 * i / max(1, wheels.size - 1))
                 axes.plot(times, force[:, wheel], color=shade, linewidth=1.1)
+            if wheels.size > 1 and np.any(on[:, wheels]):
+                heights.append(np.nanmin(force[:, wheels]))
+                names.append("front wheel dark, rear light")
+                tints.append(tint)
         for weight in _main_values(static[wheels]):
             axes.axhline(weight, color=tint, linewidth=0.9, linestyle=":")
             if (label := f"weight {format_number(weight)} {unit}") not in names:

@@ -76,6 +76,10 @@ REFUSED = [
     ("modes case.toml --set beam.ends=pinned-fre", "no end is called 'fre'; did you mean 'free'?"),
     ("sweep case.toml", "sweep needs --over: ADDRESS=START"),
     ("sweep case.toml --over loads.0.speed=1:2", "a range is START:STOP:COUNT, such as 0.3:10:64"),
+    (
+        "sweep case.toml --over loads.0.speed=40:5:90",  # as in MATLAB
+        "not START:STEP:STOP: in steps of 5 write 40:90:11, and 90 values downwards as 5:40:90",
+    ),
     ("sweep case.toml --over loads.0.speed=1:2:0.5", "a range is START:STOP:COUNT"),
     ("sweep case.toml --over loads.0.speed=1:2:1000000000", "a range may have 1e+07 values"),
     ("sweep case.toml --over loads.0.speed=1,x", "--over loads.0.speed=1,x: 'x' is not a number"),

@@ -474,6 +474,15 @@ def test_figure_of_a_quarter_car():
         assert text in said
 
 
+def test_curves_of_two_wheels_say_which_is_which():
+    truck = jb.vehicles.VehicleLoad(model="half-truck", speed=25.0)
+    record = jb.simulate(dataclasses.replace(ROAD, loads=[truck]))
+    forces = plot_record(record).axes[2]
+    front, rear = (np.mean(line.get_color()) for line in lines_of(forces, len(record.times)))
+    assert front < rear  # the darker one
+    assert "front wheel dark, rear light" in words(forces.figure)
+
+
 def test_forces_of_many_wheels_are_an_envelope():
     record = jb.simulate(WAGONS)
     forces, bodies = plot_record(record).axes[2:]
