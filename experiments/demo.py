@@ -75,7 +75,7 @@ def run(folder: str | Path | None = None, json: bool = False) -> None:
     results = jb.sweep(with_one_mass(fit.case, SLOWEST), SWEPT_VALUES, progress=False)
     plot_sweep(results).savefig(target / "map.png")
     results.to_netcdf(target / "map.nc")
-    print_progress(_worst_run_text(results))
+    print_progress(_worst_run_text(fit.case, results))
 
     print_progress(
         "\n3. A controller tuned by gradients on four loads, and compared on four others ..."
@@ -115,13 +115,14 @@ def with_initial_controller(case: jb.Case) -> jb.Case:
     )
 
 
-def _worst_run_text(results: xarray.Dataset) -> str:
+def _worst_run_text(case: jb.Case, results: xarray.Dataset) -> str:
     """Sentence on the largest deflection of the sweep, and the runs that lose contact."""
     peaks = results.peak_deflection
-    worst = peaks.isel(peaks.argmax(list(peaks.dims)))
+    place = peaks.argmax(list(peaks.dims))
+    worst, sensor = peaks.isel(place), case.sensors[int(place["sensor"])]
     lost_contact_share = results.contact_lost_time.notnull().any("load").mean()
     return (
-        f"largest deflection {1e3 * float(worst):.3g} mm, at {str(worst.sensor.values)}, under"
+        f"largest deflection {1e3 * float(worst):.3g} mm, at {float(sensor.position):g} m, under"
         f" {float(worst[MASS]):.3g} kg at {float(worst[SPEED]):.3g} m/s;"
         f" in {float(lost_contact_share):.0%} of the runs the load would lift off"
     )

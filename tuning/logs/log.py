@@ -40,7 +40,7 @@ class LogWarning(UserWarning):
     """Warning about the way in which a log was read, or about its times."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """Samples of some channels over time, in SI units.
 
@@ -110,6 +110,16 @@ class Log:
             frozen = np.array(getattr(self, name))
             frozen.flags.writeable = False
             object.__setattr__(self, name, frozen)
+
+    def __repr__(self) -> str:
+        """What was read: samples, duration, channels with units in the file and their sensors."""
+        lines = [f"Log {self.source}: {self.times.size} samples in {self.duration:.6g} s"]
+        parts = {"sensor": self.sensors, "actuator": self.actuators, "at": self.positions}
+        for i, channel in enumerate(zip(self.names, self.quantities, self.units, strict=True)):
+            of_case = [f"{word} {own[i]:g}" for word, own in parts.items() if own[i] is not None]
+            name, quantity, unit = channel
+            lines.append(", ".join([f"  {name}: {quantity} in {unit}", *of_case]))
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
     @property
     def duration(self) -> float:

@@ -83,6 +83,15 @@ def test_shapes_of_samples_are_said_and_lists_taken():
             unchecked_log(times, values)
 
 
+def test_a_log_prints_its_channels_not_its_samples(tmp_path):
+    log = read_log(write(tmp_path, FORMATS["comma"]))
+    log = dataclasses.replace(log, sensors=(1, None), actuators=(None, 0))
+    first, *channels = repr(log).splitlines()
+    assert first.endswith("run.csv: 3 samples in 0.2 s")
+    expected = ["  d1: deflection in mm, sensor 1", "  d2: deflection in mm, actuator 0"]
+    assert channels == expected
+
+
 def test_a_log_cannot_be_changed(tmp_path):
     log = read_log(write(tmp_path, FORMATS["comma"]))
     with pytest.raises(ValueError, match="read-only"):
