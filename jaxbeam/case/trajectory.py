@@ -20,7 +20,7 @@ from jaxbeam.runtime.arrays import (
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 SAME_TIME = 1e-12  # of a time: a sample that is earlier by less is at it
-SAME_FRACTION = 1e-9  # of a crossing, likewise
+SAME_FRACTION = 1e-6  # of a crossing, likewise, in single precision, too
 SAME_SAMPLE = 3e-7  # of a time, likewise in single precision
 
 

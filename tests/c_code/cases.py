@@ -232,6 +232,17 @@ CASES = {
             period=PERIOD,
         )
     ),
+    # The mass is identified at 0.38 s, which is a sample, also in single precision.
+    "feedback-scheduled-at-a-sample": rig(
+        ScheduledFeedback(
+            [0.2, 0.6],
+            [[1e3, 2e3], [1e3, 3e3]],
+            load_identification=LoadIdentification(gates=[-0.2, -0.1]),
+            period=1e-2,
+        ),
+        loads=[jb.MovingMass(mass=0.5, speed=1.0, entry_time=0.2)],
+        run=Run(duration=0.5),
+    ),
     "feedback-stepped": rig(
         ScheduledFeedback(
             [0.2, 0.3, 0.5],
