@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import zipfile
@@ -78,8 +79,10 @@ def save(
 
     Raises FileExistsError if the file exists, without `overwrite`.
     """
+    in_memory = io.BytesIO()  # closed before a full disk may end the write
+    np.savez(in_memory, fingerprint=np.array(digest), **arrays)
     with whole_file(path, overwrite) as partial, open(partial, "wb") as file:
-        np.savez(file, fingerprint=np.array(digest), **arrays)
+        file.write(in_memory.getbuffer())
         file.flush()
         os.fsync(file.fileno())
 
