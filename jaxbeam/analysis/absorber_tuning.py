@@ -67,7 +67,7 @@ def tuned_absorber(
         raise ValueError(
             f"mode must be from 1 to {case.beam.modes}, those of the case; it is {mode!r}"
         )
-    if is_concrete(mass) and not concrete(mass) > 0:
+    if is_concrete(mass) and not concrete(mass, "mass") > 0:
         raise ValueError(f"mass must be positive, in kg; it is {mass:g}")
     found = modes(case)
     shape = found.shapes(xp.asarray(position, float))[mode - 1]

@@ -154,12 +154,12 @@ class Case(Module):
         track: Track | None = None,
     ):
         self.beam = beam
-        self.supports = tuple(supports)
-        self.absorbers = tuple(absorbers)
-        self.actuators = tuple(actuators)
-        self.sensors = tuple(sensors)
-        self.loads = tuple(loads)
-        self.vehicle_sensors = tuple(vehicle_sensors)
+        self.supports = _listed("supports", supports)
+        self.absorbers = _listed("absorbers", absorbers)
+        self.actuators = _listed("actuators", actuators)
+        self.sensors = _listed("sensors", sensors)
+        self.loads = _listed("loads", loads)
+        self.vehicle_sensors = _listed("vehicle_sensors", vehicle_sensors)
         self.track = track
         self.profile = profile
         self.contact = contact
@@ -210,6 +210,13 @@ class Case(Module):
     def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:
         """Sensors on the beam, then those on vehicles: the channels of a log."""
         return (*self.sensors, *self.vehicle_sensors)
+
+
+def _listed(key: str, listed: Any) -> tuple:
+    """Parts at a key that holds any number of them. Raises ValueError where they are no list."""
+    if not isinstance(listed, Iterable) or isinstance(listed, type):
+        raise ValueError(f"{key} takes a list of parts, not {describe_value(listed)}")
+    return tuple(listed)
 
 
 class PartClass(typing.NamedTuple):
@@ -318,12 +325,21 @@ def _is_left_out(case: Case, address: str) -> bool:
 
 
 def check_is_case(case: Any) -> None:
-    """Check that what a function is given is a case. Raises TypeError for anything else."""
+    """Check that what a function is given is a case, of parts of the right classes.
+
+    Raises TypeError for anything else, ValueError for a part of another class.
+    """
     if not isinstance(case, Case):
         raise TypeError(
             f"a jaxbeam.Case is needed, not a {type(case).__name__}; make one of parts by"
             " jaxbeam.Case(beam, ...), of a file by jaxbeam.load_case(path)"
         )
+    for address, part, part_class in parts(case):
+        if not isinstance(part, part_class):
+            raise ValueError(
+                f"{address} holds {describe_value(part)}; it takes objects of type"
+                f" {part_class.__name__}"
+            )
 
 
 def list_sizes(case: Case) -> dict[str, int]:

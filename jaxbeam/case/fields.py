@@ -340,7 +340,7 @@ def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
     """
     if not (is_concrete(positions) and is_concrete(length)):
         return
-    end, numbers = float(concrete(length)), concrete(positions)
+    end, numbers = float(concrete(length)), concrete(positions, name)
     outside = ~(
         (numbers >= -POSITION_TOLERANCE * end) & (numbers <= (1 + POSITION_TOLERANCE) * end)
     )
@@ -538,4 +538,7 @@ def describe_value(value: Any) -> str:
         return SHORT_REPR.repr(value)
     if hasattr(value, "dtype"):
         return f"an array of {value.dtype}"
-    return f"a {type(value).__name__}"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}"

@@ -142,9 +142,9 @@ class _LiftingRun:
         if self.loads.profile is not None:
             height += np.ptp(np.asarray(self.loads.profile.heights(position)[0]))
         frequency = np.pi * np.max(np.abs(speed)) / length + np.sqrt(np.min(stiffness))
-        gap = ROUNDING * max(float(height), LEAST)
-        force = ROUNDING * max(float(np.max(weight)), LEAST)
-        return force, gap, RATES * gap * max(float(frequency), LEAST)
+        gap = max(ROUNDING * float(height), LEAST)
+        force = max(ROUNDING * float(np.max(weight)), LEAST)
+        return force, gap, max(RATES * gap * float(frequency), LEAST)
 
     def over(self, grid: TimeGrid, events) -> UnilateralRun:
         """Integrate over the steps of a grid and return the run."""

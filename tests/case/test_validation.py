@@ -1,8 +1,10 @@
 """Validation of cases: errors name the address and the remedy, before anything compiles."""
 
 import dataclasses
+import inspect
 import re
 import time
+import types
 
 import equinox as eqx
 import jax
@@ -221,12 +223,36 @@ CASES = [
         Case(BEAM, loads=[Shaker(0.2)]),
         "loads.0 holds a Shaker; it takes objects of type AbstractLoad",
     ),
+    (
+        Case(BEAM, absorbers=[jb.Absorber]),
+        "absorbers.0 holds the class Absorber; it takes objects of type Absorber",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("case", "message"), CASES)
 def test_contradictions_are_refused(case, message):
     assert_refused(case, message)
+
+
+@pytest.mark.parametrize("key", [key for key, of in part_classes().items() if not of.listed])
+def test_one_part_of_another_class_is_refused(key):
+    """By every function of a case, before it reads anything of the part."""
+    for wrong, what in (("x", "'x'"), (3.0, "3.0"), (jb.Absorber(0.1), "an Absorber")):
+        case = eqx.tree_at(
+            lambda c: getattr(c, key), CASE, wrong, is_leaf=lambda part: part is None
+        )
+        for function in (jb.simulate, jb.Simulator, jb.modes):
+            with pytest.raises(ValueError, match=f"^{key} holds {what}; it takes objects of type"):
+                function(case)
+
+
+@pytest.mark.parametrize("key", [key for key, of in part_classes().items() if of.listed])
+def test_parts_that_are_no_list_are_refused(key):
+    unchecked = inspect.unwrap(Case.__init__)  # types of arguments are checked in tests alone
+    for wrong, what in ((jb.Absorber(0.1), "an Absorber"), (jb.Absorber, "the class Absorber")):
+        with pytest.raises(ValueError, match=f"^{key} takes a list of parts, not {what}$"):
+            unchecked(types.SimpleNamespace(), BEAM, **{key: wrong})
 
 
 def test_wrong_shapes_and_types_are_refused():

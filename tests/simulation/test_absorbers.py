@@ -1,6 +1,7 @@
 """Tuned mass dampers and inerters: published and independent numbers, and energy."""
 
 import dataclasses
+import inspect
 
 import numpy as np
 import pytest
@@ -374,6 +375,11 @@ def test_warburton_has_the_least_variance(mass_ratio):
 
 
 def test_tuned_absorber_refusals():
+    tune = inspect.unwrap(jb.tuned_absorber)  # types of arguments are checked in tests alone
+    with pytest.raises(ValueError, match="^mass must be a real number, not 'x'"):
+        tune(jb.Case(BRIDGE), 12.5, mass="x")
+    with pytest.raises(ValueError, match="^position must be a real number, not 'x'"):
+        tune(jb.Case(BRIDGE), "x", mass=1.0)
     case = jb.Case(BRIDGE)
     for arguments, words in (
         ({"position": 12.5, "mass": 1.0, "mode": 2}, "at a node of mode 2"),

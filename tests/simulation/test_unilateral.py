@@ -300,6 +300,13 @@ def test_record_of_flights_in_files_and_figures(tmp_path):
     assert nothing.flights is None
 
 
+def test_wheels_without_weight_on_a_level_road_stay():
+    """Warnings of NumPy are errors here."""
+    case = dataclasses.replace(lifting_case("take-off before the end"), run=jb.Run(0.5, gravity=0))
+    record = jb.simulate(case)
+    assert not record.flights.wheel.size and not np.any(record.coordinates)
+
+
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_mass_of_fig_2_27_flies():
     """Held down, it pulls with many times its weight, and peaks depend on the number of modes."""
