@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import no_bound
 from jaxbeam.analysis.compare import Comparison, compare
-from jaxbeam.case.case import Case, replace, value_at
+from jaxbeam.case.case import Case, replace, unit_at, value_at
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
@@ -226,7 +226,7 @@ class TuningResult(TableViews):
         panels = [
             TuningPanel(
                 title=f"{outcome.name} runs",
-                labels=_run_labels(outcome),
+                labels=_run_labels(self.case, outcome),
                 uncontrolled=outcome.uncontrolled_peaks,
                 before=outcome.peaks_before,
                 after=outcome.peaks_after,
@@ -267,10 +267,14 @@ def _metric_table(objective: Objective, run_sets: list[RunSetResult]) -> list[st
     ]
 
 
-def _run_labels(outcome: RunSetResult) -> list[str]:
-    """A label for each run: the last word of each address that varies, and its value."""
+def _run_labels(case: Case, outcome: RunSetResult) -> list[str]:
+    """A label for each run: the last word of each address that varies, its value and unit."""
+    units = {address: unit_at(case, address) for run in outcome.runs for address in run}
     return [
-        ", ".join(f"{address.rsplit('.', 1)[-1]} {value:g}" for address, value in run.items())
+        ", ".join(
+            f"{address.rsplit('.', 1)[-1]} {value:g} {units[address]}".removesuffix(" 1").rstrip()
+            for address, value in run.items()
+        )
         for run in outcome.runs
     ]
 

@@ -182,7 +182,8 @@ def test_the_result_on_training_and_held_out_runs(tuned):
     assert GAIN in str(tuned) and "held out runs: peaks in mm" in str(tuned)
     assert tuned.to_dict()["numbers"][GAIN]["after"] == tuned.values[0]
     assert tuned.history.shape == (25, 2) and tuned.rejected_steps == 0
-    tuned.plot()
+    label = tuned.plot().axes[0].get_yticklabels()[0].get_text()
+    assert " kg" in label and " m/s" in label
 
 
 def test_another_seed_reaches_the_same_objective(tuned):
