@@ -260,7 +260,8 @@ class _LiftingRun:
     def cut(self, piece: Piece, wheel: int, ends, near):
         """The piece until a wheel's event between two fractions of it, with its steps.
 
-        `near` are estimates of the event function at these `ends`; None if there is no event.
+        `near` are estimates of the event function at these `ends`; None if there is no event. A
+        zero from which the function rises, as that at the start of a flight, is none.
         """
 
         def until(fraction):
@@ -279,15 +280,16 @@ class _LiftingRun:
             if not low < fraction < high:
                 fraction = (low + high) / 2
             trial, value = until(fraction)
-            if abs(value) <= EXACT:
+            rises = value > self.event_function(*trial, 0, 0, wheel)
+            if abs(value) <= EXACT and not rises:
                 return trial
-            if value > 0:
+            if value > 0 or (rises and value > -EXACT):
                 low = fraction
             else:
                 high, best = fraction, trial
             if (high - low) * piece.length <= SAME_TIME * self.duration:
                 break
-            fraction = fraction - value / slope
+            fraction = fraction - value / slope if abs(value) > EXACT else low
         return best
 
     def switch(self, wheel: int, steps: Steps, i: int, point: int) -> None:
@@ -305,7 +307,7 @@ class _LiftingRun:
             self.lift(wheel, steps, i, point)
             return
         law, (height, rate) = self.law, self.surface(steps, i, point)
-        self.pressing[wheel] = True
+        self.pressing[wheel], flight = True, self.flying.pop(wheel)  # an impact may lift it anew
         time, position = self.place(wheel, steps, i, point)
         landing = {"landing_time": time, "landing_position": position}
         if law.rigid[wheel]:
@@ -317,7 +319,7 @@ class _LiftingRun:
             last = self.pieces[-1]
             landing["approach_speed"] = -float(SLOPE_AT_END @ last.gap[wheel]) / last.length
             landing["impulse"] = 0.0
-        self.landed.append(self.flying.pop(wheel) | landing)
+        self.landed.append(flight | landing)
 
     def lift(self, wheel: int, steps: Steps, i: int, point: int) -> None:
         """Change a wheel from contact to flight at an end of a step."""

@@ -325,3 +325,21 @@ def test_mass_of_fig_2_27_flies():
         peaks.append([bilateral.peak_deflection.max(), flying.peak_deflection.max()])
     change = np.abs(np.subtract(*peaks) / peaks[1])
     assert change[0] > 0.2 and change[1] < 0.05
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.model.plausibility.check.PlausibilityWarning")
+def test_a_wheel_that_another_throws_up_does_not_land_while_it_rises():
+    """A landing wheel throws the other up, slowly: its flight is far shorter than a step."""
+    case = jb.Case(
+        jb.Beam(
+            50.0, 4e9, 4e3, damping_ratio=0.01, modes=2, shear_stiffness=1e9, rotary_inertia=3e3
+        ),
+        supports=[jb.Support(25.0)],
+        loads=[jb.MovingMass(9000.0, 42.0), jb.MovingMass(3000.0, 42.0, entry_time=0.2)],
+        contact=LIFTING,
+        run=jb.Run(0.20702, sample_rate=1000.0),
+    )
+    flights = jb.simulate(case).flights
+    assert flights.wheel[0] == 1 and 1 < flights.wheel.size < 30
+    landed = ~np.isnan(flights.landing_time)
+    assert np.all(flights.approach_speed[landed] > 0) and np.all(flights.impulse[landed] > 0)
