@@ -21,6 +21,7 @@ from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     OF_QUANTITY,
     POSITIVE,
+    check_fields,
     choice,
     concrete,
     count,
@@ -482,9 +483,14 @@ def _has_entry(leaf, entry: tuple[int, ...]) -> bool:
 def concrete_case(case: Case) -> Case:
     """The case with concrete numbers, also while it is differentiated.
 
-    Raises `jaxbeam.case.fields.TracedNumberError` if it is traced by `jit` or `vmap`.
+    Raises `jaxbeam.case.fields.TracedNumberError` if it is traced by `jit` or `vmap`, ValueError
+    for what is no number or no part.
     """
-    found = [concrete(leaf, address) for address, leaf in leaves_by_address(case).items()]
+    leaves = leaves_by_address(case)
+    if not all(map(is_real, leaves.values())):
+        for address, part, _ in parts(case):
+            check_fields(address, part)
+    found = [concrete(leaf, address) for address, leaf in leaves.items()]
     return jax.tree.unflatten(jax.tree.structure(case), found)
 
 

@@ -39,10 +39,19 @@ def _as_array(unit: str, meaning: str):
     """
 
     def convert(value):
+        """The number. Raises ValueError for rows that are not equally long."""
         if isinstance(value, str | list | tuple) and _has_text(value):
             value = in_si(value, unit, meaning)
         listed = isinstance(value, int | float | np.ndarray | np.generic | list | tuple)
-        return xp.asarray(value, float) if listed and is_real(value) else value
+        if not listed or not is_real(value):
+            return value
+        try:
+            return xp.asarray(value, float)
+        except ValueError:
+            raise ValueError(
+                f"{meaning}: give numbers in rows that are equally long, not"
+                f" {describe_value(value)}"
+            ) from None
 
     return convert
 

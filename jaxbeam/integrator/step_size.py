@@ -87,8 +87,7 @@ CLOSE_SAMPLES = 0.5  # fraction of a step; closer samples need no trial with the
 MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
 NO_STEP = (
     "no time step makes the response agree to {:g}; it is unstable, or its frequencies are too far"
-    " apart: check stiffnesses, masses and damping, or keep fewer modes (beam.modes); or a law in"
-    " continuous time switches too often: give it a period, or a larger tolerance"
+    " apart: check stiffnesses, masses and damping, or keep fewer modes (beam.modes)"
 )
 ROUNDING = 1e-9  # fraction of the deflection under all loads; smaller ones are not compared
 SMALLEST_TOLERANCE = 1e-14  # some fifty units in the last place of double precision

@@ -584,4 +584,10 @@ def _halve_until_converged(
         if halvings >= MAX_DIVERGED_HALVINGS and not np.isfinite(fine).all():
             break
         coarse = fine
-    raise RuntimeError(NO_STEP.format(tolerance))
+    if not np.isfinite(error):
+        raise RuntimeError(NO_STEP.format(tolerance))
+    raise RuntimeError(
+        f"no time step makes the response agree to {tolerance:g}, and the shortest one to"
+        f" {error:.1e}, as forces bend or jump within it; give a tolerance above that, or a law in"
+        " continuous time a period"
+    )

@@ -6,6 +6,7 @@ import logging
 import re
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -183,6 +184,14 @@ def test_gradients_through_filter_hold_delay_and_saturation(plan, record, deriva
 
 ACTUATOR = HELD.actuators[0]
 SAMPLED = "needs a controller that samples: give controller.period"
+
+
+def estimated_by(value) -> jb.LQR:
+    """Regulator with something in the place of its estimator, whose class no one has checked."""
+    law = jb.LQR([1.0], [1.0], period=0.01)
+    return eqx.tree_at(lambda c: c.estimator, law, value, is_leaf=lambda x: x is None)
+
+
 ERRORS = [
     ({"actuators": ()}, "controller has nothing to command: add an actuator that takes commands"),
     ({"controller": jb.Feedback([1.0, 2.0])}, "controller.gains must list one gain for each of 1"),
@@ -274,6 +283,14 @@ ERRORS = [
     ),
     ({"controller": jb.Feedback([np.nan])}, "controller.gains.0 must be a finite number"),
     ({"controller": "feedback"}, "controller holds 'feedback'; it takes objects of type"),
+    (
+        {"controller": estimated_by("kalman")},
+        "controller.estimator holds 'kalman'; it takes a table of its own, in Python a",
+    ),
+    (
+        {"controller": estimated_by(jb.Kalman)},
+        "it takes a table of its own, in Python a Inversion or Kalman or",
+    ),
 ]
 
 
@@ -286,6 +303,13 @@ def test_errors_of_controllers(changes, message):
         with pytest.raises(ValueError, match=re.escape(message)) as caught:
             function(case)
         assert "\n" not in str(caught.value)
+
+
+def test_rows_of_gains_are_equally_long():
+    with pytest.raises(
+        ValueError, match="for each actuator: give numbers in rows that are equally"
+    ):
+        jb.OutputFeedback([[1.0, 2.0], [3.0]])
 
 
 TABLES = [
