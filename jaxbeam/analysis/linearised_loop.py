@@ -473,6 +473,7 @@ def standing_mass(case: Case, position: float, mass: float) -> LoadSet:
 
     Raises ValueError for a position off the beam, and a mass that is negative or not finite.
     """
+    position, mass = float(concrete(position, "position")), float(concrete(mass, "mass"))
     length = float(concrete(case.beam.length))
     if not 0 <= position <= length:
         raise ValueError(f"the mass at {position:g} m is off the beam, 0 to {length:g} m")

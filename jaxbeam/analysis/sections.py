@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic, PortSignal
+from jaxbeam.case.arguments import check_classes
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import (
@@ -210,6 +211,7 @@ def envelope(
     >>> print(f"{1e3 * low[0]:.2f} mm")
     -2.00 mm
     """
+    check_classes(envelope, case=case, quantity=quantity)
     quantity_of(quantity, fibre_distance, section_modulus)
     plan = dataclasses.replace(integration_plan(case, tolerance=tolerance), error=0.0)
     calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope

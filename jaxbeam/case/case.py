@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
+from jaxbeam.case.arguments import describe_value, wrong_class
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.contact import AbstractContact
 from jaxbeam.case.controller import AbstractController
@@ -25,7 +26,6 @@ from jaxbeam.case.fields import (
     choice,
     concrete,
     count,
-    describe_value,
     is_concrete,
     is_real,
     number,
@@ -331,10 +331,7 @@ def check_is_case(case: Any) -> None:
     Raises TypeError for anything else, ValueError for a part of another class.
     """
     if not isinstance(case, Case):
-        raise TypeError(
-            f"a jaxbeam.Case is needed, not a {type(case).__name__}; make one of parts by"
-            " jaxbeam.Case(beam, ...), of a file by jaxbeam.load_case(path)"
-        )
+        raise TypeError(wrong_class("case", case, Case))
     for address, part, part_class in parts(case):
         if not isinstance(part, part_class):
             raise ValueError(

@@ -13,7 +13,6 @@ import importlib.util
 import inspect
 import pkgutil
 import re
-import reprlib
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from importlib.abc import InspectLoader
@@ -25,6 +24,7 @@ import jax.extend
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import check_call, describe_value
 from jaxbeam.case.former_words import KINDS, WORDS
 from jaxbeam.case.toml_file import check_count, check_entries, check_length, in_si
 from jaxbeam.runtime.arrays import Array, any_traced, not_differentiated, xp
@@ -218,11 +218,15 @@ def _holds_traced(leaf) -> bool:
 
 
 def refuses_traced(what: str, instead: str = OUTSIDE) -> Callable[[F], F]:
-    """Decorator that refuses traced arguments; its error names `what` the function returns."""
+    """Decorator that refuses arguments that are traced, or of other classes than declared.
+
+    Its errors are a ValueError that names `what` the function returns, and a TypeError.
+    """
 
     def decorated(function: F) -> F:
         @functools.wraps(function)
         def refusing(*args, **kwargs):
+            check_call(function, args, kwargs)
             refuse_traced(what, instead, args, kwargs)
             return function(*args, **kwargs)
 
@@ -333,9 +337,6 @@ def _subclasses(part_class: type) -> list[type]:
 def _full_name(part_class: type) -> str:
     return f"{part_class.__module__}.{part_class.__qualname__}"
 
-
-SHORT_REPR = reprlib.Repr()  # shortens wrong values, which error messages quote
-SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10
 
 # Sizes of numbers: products and quotients of three do not overflow. What must be positive divides.
 SMALLEST, LARGEST = 1e-100, 1e100
@@ -539,15 +540,3 @@ def _unit_suffix(field: dataclasses.Field) -> str:
 def in_unit(field: dataclasses.Field) -> str:
     """Unit of a field in words, such as " in N/m"; empty where it has none."""
     return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
-
-
-def describe_value(value: Any) -> str:
-    """A wrong value as error messages quote it."""
-    if isinstance(value, str | bool | int | float | list | dict):
-        return SHORT_REPR.repr(value)
-    if hasattr(value, "dtype"):
-        return f"an array of {value.dtype}"
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
-    name = type(value).__name__
-    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}"

@@ -16,6 +16,7 @@ from typing import Any
 
 import tomli_w
 
+from jaxbeam.case.arguments import describe_value
 from jaxbeam.case.case import (
     Case,
     check_distinct,
@@ -26,7 +27,7 @@ from jaxbeam.case.case import (
     unknown_address_error,
 )
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import concrete, describe_value, kind_of, kinds, refuses_traced, suggestion
+from jaxbeam.case.fields import concrete, kind_of, kinds, refuses_traced, suggestion
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.loads.vehicles import IMPLIED, is_path
 from jaxbeam.case.profiles.shapes import TableProfile

@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import describe_value
 from jaxbeam.case.case import Case, concrete_case, replace
-from jaxbeam.case.fields import concrete, describe_value, is_real, refuse_traced
+from jaxbeam.case.fields import concrete, is_real, refuse_traced
 from jaxbeam.case.toml_file import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history, longest_force_step, max_stable_step

@@ -11,8 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbeam.case.arguments import describe_value
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import check_on_beam, concrete, describe_value, is_concrete, real_numbers
+from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, real_numbers
 from jaxbeam.case.sensors import TWIST, TWIST_RATE
 from jaxbeam.case.track import Kernel
 from jaxbeam.case.trajectory import NEVER

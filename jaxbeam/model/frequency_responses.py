@@ -34,6 +34,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.arguments import check_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import (
     check_on_beam,
@@ -407,6 +408,7 @@ def frequency_response(
     >>> print(responses.values.shape)  # frequency, pair
     (2, 1)
     """
+    check_classes(frequency_response, case=case, pairs=pairs, layout=layout)
     check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),

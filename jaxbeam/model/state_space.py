@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
+from jaxbeam.case.arguments import check_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import OUTSIDE, concrete, is_concrete, refuse_traced, refuses_traced
@@ -439,6 +440,7 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     >>> print(jb.state_space(case).at(0.1).A.shape)
     (6, 6)
     """
+    check_classes(state_space, case=case, coordinates=coordinates, layout=layout)
     if layout is None:
         check_plant(case)
     return build_plant(case, compiled_modal_model(case, layout), coordinates)

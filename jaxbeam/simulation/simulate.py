@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbeam.case.arguments import check_classes
 from jaxbeam.case.case import Case, check_is_case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.controller import AbstractController
@@ -130,6 +131,7 @@ def simulate(
     2.00 mm
     """
     check_is_case(case)
+    check_classes(simulate, plan=plan)
     if times is not None:
         check_times(times)
     sampling = case.run.duration, case.run.sample_rate

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import describe_value
 from jaxbeam.case.case import (
     Case,
     addresses,
@@ -27,7 +28,7 @@ from jaxbeam.case.case import (
     unit_at,
 )
 from jaxbeam.case.contact import ONE_RUN
-from jaxbeam.case.fields import concrete, describe_value
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import QUANTITIES, Sensor

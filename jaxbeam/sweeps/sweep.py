@@ -12,14 +12,14 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxbeam.case.case import ALL, Case, address_words, addresses, unit_at
-from jaxbeam.case.fields import OUTSIDE, describe_value, refuses_traced
+from jaxbeam.case.fields import OUTSIDE, refuses_traced
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.spectra import profiles_of_runs
 from jaxbeam.case.toml_file import in_si
@@ -429,11 +429,6 @@ def sweep(
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
-    if not isinstance(over, Mapping):
-        raise ValueError(
-            "over maps addresses to lists of values, as {'loads.0.speed': [1, 2]}, not"
-            f" {describe_value(over)}"
-        )
     words, numbers = split_words(case, over)
     settings = paired, histories, tolerance, precision, memory
     if words:

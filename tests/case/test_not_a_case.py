@@ -62,13 +62,20 @@ asked = [
     (lambda word: jb.ride.weighted_rms(word, [1.0]), "times takes numbers in s"),
     (lambda word: jb.ride.sperling_index([0.0], word), "acceleration takes numbers in m/s^2"),
     (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes what mesh_layout"),
-    (lambda word: jb.sweep(case, word), "over maps addresses to lists"),
+    (lambda word: jb.influence_line(case, 0.5, layout=word), "layout takes a jaxbeam.Layout or"),
+    (lambda word: jb.modes(case, word), "layout takes a jaxbeam.Layout or None"),
+    (lambda word: jb.simulate(case, plan=word), "plan takes a jaxbeam.IntegrationPlan or None"),
+    (lambda word: jb.sweep(case, word), "over takes a mapping by names or addresses"),
+    (lambda word: jb.sweep(case, {}, paired=word), "paired takes True or False"),
+    (lambda word: jb.assess(case, 40.0, dynamic=word), "dynamic takes True or False or None"),
+    (lambda word: jb.bound(case, spacing=word), "spacing must be a real number"),
+    (lambda word: jb.save(jb.simulate(case), "x.csv", word), "overwrite takes True or False"),
     (lambda word: jb.replace(case, word), "values map addresses to numbers"),
 ]
 for ask, message in asked:
     try:
         ask("moment")
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         assert str(error).startswith(message) and "'moment'" in str(error), (message, error)
     else:
         raise AssertionError(message)
@@ -91,14 +98,36 @@ def test_it_is_said_that_a_word_is_no_number(tmp_path):
 TUNING = """
 import jaxbeam as jb, tuning
 case, loads = jb.load_case("examples/controlled_rig/case.toml"), {"loads.0.mass": 0.25}
-try:
-    tuning.tune(case, {"controller.gains.0": None}, tuning.LoadCases((loads,)), lambda x: 0.0)
-except TypeError as error:
-    assert "objective must be a tuning.Objective, not function; a function of" in str(error), error
-else:
-    raise AssertionError
+free, loads = {"controller.gains.0": None}, tuning.LoadCases((loads,))
+log = tuning.read_log("jaxbeam/demo/log_1.csv")
+objective = "objective takes a tuning.Objective or None, not a function; a function of your own"
+a_log = "logs takes a tuning.Log or a list of tuning.Log, not"
+of_a_word = [
+    (lambda word: tuning.identify(case, word, "beam.length"), f"{a_log} 'x'; tuning.read_log"),
+    (lambda word: tuning.identify(case, [log, word], "beam.length"), f"{a_log} ["),
+    (lambda word: tuning.identify(case, log, ["beam.length", 3]), "free takes a mapping"),
+    (lambda word: tuning.identify(case, log, "beam.length", starts=word), "starts takes a whole n"),
+    (lambda word: tuning.identify(case, log, "beam.length", resume=word), "resume takes True or"),
+    (lambda word: tuning.tune(case, free, word), "a tuning.LoadCases is needed, not a str; make"),
+    (lambda word: tuning.tune(case, free, loads, steps=word), "steps takes a whole number, not"),
+    (lambda word: tuning.tune(case, free, loads, lambda values: 0.0), objective),
+    (lambda word: tuning.weigh(case, word, (1.0, 2.0)), "a tuning.Log is needed, not a str;"),
+    (lambda word: tuning.weigh(case, log, (1.0,)), "speeds takes a list of 2 numbers, not"),
+    (lambda word: tuning.identify_modes(log, band=word), "band takes a list of 2 numbers or None"),
+    (lambda word: tuning.identify_from_modes(case, word, free), "a tuning.ModalEstimates is n"),
+    (lambda word: tuning.full_grid(word), "values takes a mapping by names or addresses"),
+    (lambda word: tuning.full_grid({"loads.0.mass": word}), "loads.0.mass: give a list of numbers"),
+]
+for ask, message in of_a_word:
+    try:
+        ask("x")
+    except (TypeError, ValueError) as error:
+        assert str(error).startswith(message), (message, error)
+    else:
+        raise AssertionError(message)
 """
 
 
-def test_it_is_said_that_an_objective_is_no_function():
+def test_it_is_said_of_what_class_an_argument_of_a_fit_is():
+    """It was said that a str has no `valid`, and words were taken as True."""
     subprocess.run([sys.executable, "-c", TUNING], check=True, cwd=ROOT)

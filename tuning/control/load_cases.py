@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
+from jaxbeam.case.arguments import describe_value
 from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
 from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
@@ -83,10 +84,15 @@ def _all_pairs(
 def full_grid(values: Mapping[str, Sequence[float | int]]) -> tuple[AddressValues, ...]:
     """Full grid: every combination of the values given by address.
 
+    Raises ValueError where the values at an address are no list.
+
     >>> import tuning
     >>> print(*tuning.full_grid({"loads.0.mass": [0.2, 0.4]}))
     {'loads.0.mass': 0.2} {'loads.0.mass': 0.4}
     """
+    for address, listed in values.items():
+        if np.ndim(listed) != 1:
+            raise ValueError(f"{address}: give a list of numbers, not {describe_value(listed)}")
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 

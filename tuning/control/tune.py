@@ -144,13 +144,8 @@ def check_arguments(
 ) -> None:
     """Check the arguments of a tuning.
 
-    Raises ValueError for the first that is wrong, TypeError for another objective.
+    Raises ValueError for the first that is wrong.
     """
-    if not isinstance(objective, Objective):
-        raise TypeError(
-            f"objective must be a tuning.Objective, not {type(objective).__name__}; a function of"
-            " your own, of the values by address, is added to it as `penalty`"
-        )
     if steps < 1 or starts < 1:
         raise ValueError(f"steps and starts must be 1 or more; they are {steps} and {starts}")
     if "shortfall" in objective.weights | objective.limits and not least_peaks:

@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 from jaxbeam.case.actuators.electrodynamic import limited_loops
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.controller import commanded
-from jaxbeam.case.fields import check_on_beam, real_numbers, refuses_traced
+from jaxbeam.case.fields import check_on_beam, concrete, real_numbers, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
@@ -601,9 +601,9 @@ def checked_influence(
     period = (
         float(DEFAULT_PERIOD if own_period is None else own_period)
         if period is None
-        else float(period)
+        else float(concrete(period, "period"))
     )
-    spacing = 1 / float(case.run.sample_rate) if spacing is None else float(spacing)
+    spacing = float(concrete(1 / case.run.sample_rate if spacing is None else spacing, "spacing"))
     positions = _checked_positions(case, positions)
     if not case.actuators:
         raise ValueError("a bound needs actuators, and the case has none; add one")
