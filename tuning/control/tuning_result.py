@@ -167,7 +167,7 @@ class TuningResult(TableViews):
         ]
         lines = text_table(("parameter", "before", "after", "unit", ""), rows, "<>><<")
         for outcome in self.run_sets:
-            lines += ["", *_run_table(outcome)]
+            lines += ["", *_run_table(self.case, outcome)]
         lines += ["", *_metric_table(self.objective, self.run_sets)]
         if len(self.start_results) > 1:
             lines += ["", "minima by start:", *_start_lines(self.start_results)]
@@ -289,7 +289,7 @@ def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
     return lines
 
 
-def _run_table(run_set: RunSetResult) -> list[str]:
+def _run_table(case: Case, run_set: RunSetResult) -> list[str]:
     """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
     varied = value_columns(run_set.runs)
     peaks = {
@@ -312,7 +312,9 @@ def _run_table(run_set: RunSetResult) -> list[str]:
         ]
         for i in range(len(run_set.runs))
     ]
-    header = [*varied, *peaks, *shares]
+    units = {name: unit_at(case, name) for name in varied}
+    heads = [name if units[name] in ("", "1") else f"{name} ({units[name]})" for name in varied]
+    header = [*heads, *peaks, *shares]
     return [title, *text_table(header, rows, ">" * len(header))]
 
 

@@ -180,6 +180,7 @@ def test_the_result_on_training_and_held_out_runs(tuned):
     assert "worst held out run: peak" in tuned.verdict
     assert f"at least {held_out.attained_shares(held_out.peaks_after).min():.1%}" in tuned.verdict
     assert GAIN in str(tuned) and "held out runs: peaks in mm" in str(tuned)
+    assert "loads.0.mass (kg)  loads.0.speed (m/s)  no control" in str(tuned)
     assert tuned.to_dict()["numbers"][GAIN]["after"] == tuned.values[0]
     assert tuned.history.shape == (25, 2) and tuned.rejected_steps == 0
     label = tuned.plot().axes[0].get_yticklabels()[0].get_text()
