@@ -39,7 +39,7 @@ from jaxbeam.model.along_beam import (
 from jaxbeam.model.elements import held_positions
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.static_correction import bending_moment, corrected_history, shear_force
-from jaxbeam.model.statics import REACTION, influence_line, static_peak
+from jaxbeam.model.statics import REACTION, influence_line, static_peak, unit_of_effect
 from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.printer import TableViews
@@ -435,7 +435,7 @@ def influence_table(
     else:
         positions = np.asarray(real_numbers("load_positions", load_positions, "m", "positions"))
         found = at(positions)
-    units = ["N" if q == REACTION else QUANTITIES[q].unit for q, _, _ in lines]
+    units = [unit_of_effect(q) for q, _, _ in lines]
     return InfluenceTable(
         positions,
         found["values"],

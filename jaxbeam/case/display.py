@@ -49,11 +49,16 @@ def unit_scale(values, unit: str) -> UnitScale:
     return UnitScale(factor, prefix + unit.replace("^2", "²").replace("^3", "³"))
 
 
+def text_scale(values, unit: str) -> UnitScale:
+    """The scale of `unit_scale` for texts: values without unit ("1"), or in 1/m, stay."""
+    if unit == "" or unit.startswith("1"):
+        return UnitScale(1.0, "" if unit == "1" else unit)
+    return unit_scale(values, unit)
+
+
 def with_prefix(value: float, unit: str, digits: int = 4) -> str:
     """A number with its unit, prefixed where it has one: "1.4 mm"; "0.0002" without unit."""
-    scale = UnitScale(1.0, "") if unit in ("", "1") else unit_scale(value, unit)
-    if scale.unit.startswith("$"):
-        scale = UnitScale(1.0, unit)
+    scale = text_scale(value, unit)
     return f"{value / scale.factor:.{digits}g} {scale.unit}".rstrip()
 
 

@@ -41,6 +41,11 @@ STATIC_QUANTITIES = (
 )
 
 
+def unit_of_effect(quantity: str) -> str:
+    """SI unit of a reaction, "N", or of a quantity of the beam."""
+    return "N" if quantity == REACTION else QUANTITIES[quantity].unit
+
+
 def influence_line(
     case: Case,
     x,

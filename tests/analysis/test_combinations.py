@@ -126,6 +126,9 @@ def test_design_values_from_the_command_line(tmp_path, monkeypatch, capsys):
         printed = capsys.readouterr().out
         if not options:
             assert "moment at midspan" in printed and "persistent" in printed
+            midspan = next(line for line in printed.splitlines() if "midspan" in line)
+            assert midspan.split()[4:6] == ["MN", "m"]
+            assert float(midspan.split()[8]) == pytest.approx(6.4395, rel=1e-4)  # by hand below
     found = json.loads(printed)
     at = found["x (m)"].index(10.0)
     expected = 1.35 * (12e3 * 400 / 8 + 600e3 * 4.7 + 27e3 * 400 / 8)

@@ -166,7 +166,7 @@ def test_command(tmp_path, capsys):
         assert ended.value.code == 0
     printed = capsys.readouterr().out
     assert "moment at midspan 1" in printed
-    assert "4.17e+06" in printed
+    assert "MN m" in printed and " 4.17 " in printed
     assert "tandem 8.8-10 m" in printed
     assert "4170000" in table.read_text()
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.display import text_scale
 from jaxbeam.files.report import ReportSection, ReportTable, markdown
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.output_file import whole_file
@@ -45,16 +46,16 @@ class TrainEffects(NamedTuple):
         return np.stack([curve.values.max(axis=0) for curve in self.curves])
 
     def rows(self) -> list[list[str]]:
-        """Rows of a table: head, then an effect each with its unit, limit and every train."""
-        head = ["effect", "unit", "limit", *(curve.train for curve in self.curves)]
+        """Rows of a table: head, then an effect each with its unit, limit and every train.
+
+        Units have prefixes, as MN m.
+        """
+        rows = [["effect", "unit", "limit", *(curve.train for curve in self.curves)]]
         numbers = np.column_stack([self.limits, self.largest().T])
-        return [
-            head,
-            *(
-                [name, unit, *(f"{value:.4g}" for value in row)]
-                for name, unit, row in zip(self.names, self.units, numbers, strict=True)
-            ),
-        ]
+        for name, si_unit, row in zip(self.names, self.units, numbers, strict=True):
+            factor, unit = text_scale(row, si_unit)
+            rows.append([name, unit, *(f"{value / factor:.4g}" for value in row)])
+        return rows
 
     @property
     def lines(self) -> list[str]:
@@ -252,17 +253,13 @@ class Assessment(TableViews):
         return [f"{check.subject}: {check.remark}" for check in self.checks if check.remark]
 
     def _rows(self) -> list[list[str]]:
-        return [
-            [
-                check.subject,
-                "" if check.value is None else f"{check.value:.4g}",
-                "" if check.limit is None else f"{check.limit:.4g}",
-                "" if check.unit == "1" else check.unit,
-                check.outcome,
-                check.clause,
-            ]
-            for check in self.checks
-        ]
+        rows = []
+        for check in self.checks:
+            numbers = [one for one in (check.value, check.limit) if one is not None]
+            factor, unit = text_scale(numbers, check.unit)
+            texts = [f"{one / factor:.4g}" for one in numbers] + [""] * (2 - len(numbers))
+            rows.append([check.subject, *texts, unit, check.outcome, check.clause])
+        return rows
 
     @property
     def _inputs(self) -> list[str]:

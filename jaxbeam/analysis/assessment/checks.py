@@ -36,7 +36,7 @@ from jaxbeam.case.beam import MATERIALS
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.sensors import QUANTITIES, Sensor
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.force_peaks import force_paths, force_wheels, peaks_of_forces
 from jaxbeam.integrator.force_system import force_responses, force_system
 from jaxbeam.library.published import trains as library
@@ -50,7 +50,7 @@ from jaxbeam.model.output_rows import (
     sensor_rows,
     static_correction,
 )
-from jaxbeam.model.statics import REACTION
+from jaxbeam.model.statics import REACTION, unit_of_effect
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.sweeps.computation import failure_sentence, peaks_in_memory
 from jaxbeam.sweeps.force_runner import PHASE
@@ -457,7 +457,7 @@ def train_checks(
     effects = TrainEffects(
         (*(f"deck acceleration at {p.name}" for p in decks), *(s.name for s in sections)),
         (*("acceleration" for _ in decks), *(s.quantity for s in sections)),
-        (*("m/s^2" for _ in decks), *map(_unit, sections)),
+        (*("m/s^2" for _ in decks), *(unit_of_effect(section.quantity) for section in sections)),
         (*(code_numbers()["acceleration"][deck] for _ in decks), *limits),
         tuple(curves),
     )
@@ -490,10 +490,6 @@ def checked_sections(case: Case) -> list[CheckedSection]:
             sections.append(CheckedSection(f"end rotation at {p.name}", "rotation", p.x))
     sections += [CheckedSection(f"reaction at {p.name}", REACTION, p.x) for p in supports]
     return sections
-
-
-def _unit(section: CheckedSection) -> str:
-    return "N" if section.quantity == REACTION else QUANTITIES[section.quantity].unit
 
 
 def _largest_of(effects: TrainEffects, columns: Sequence[int]) -> tuple[int, int, int]:

@@ -153,8 +153,9 @@ def envelope(
     parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
+    from jaxbeam.case.display import text_scale
     from jaxbeam.case.toml_file import number_in_si
-    from jaxbeam.model.statics import REACTION
+    from jaxbeam.model.statics import REACTION, unit_of_effect
 
     lane_load = None if lane is None else number_in_si(lane, "N/m", "--lane")
     velocity = None if speed is None else number_in_si(speed, "m/s", "--speed")
@@ -170,6 +171,7 @@ def envelope(
         if velocity is not None and name != REACTION:
             moving = crossing_envelope(parsed_case, vehicle, velocity, x, quantity=name)
             of_crossing = list(zip(*moving, strict=True))
+        scale = text_scale([found.lowest, found.highest], unit_of_effect(name))
         for i, place in enumerate(found.positions):
             low, high = found.lowest[i], found.highest[i]
             label = places.get(float(place), "")
@@ -179,8 +181,10 @@ def envelope(
             for head, entry in zip(dynamic, of_crossing[i] or (math.nan, math.nan), strict=True):
                 dynamic[head].append(float(entry))
             largest = max(-found.lowest.min(), found.highest.max())
-            low, high, *moving = (_text(one, largest) for one in (low, high, *of_crossing[i]))
-            extremes = [low, str(found.at_lowest[i]) if low != "0" else ""]
+            low, high, *moving = (
+                _text(one, largest, scale.factor) for one in (low, high, *of_crossing[i])
+            )
+            extremes = [scale.unit, low, str(found.at_lowest[i]) if low != "0" else ""]
             extremes += [high, str(found.at_highest[i]) if high != "0" else ""]
             if velocity is not None:
                 extremes += moving or ["", ""]
@@ -193,9 +197,9 @@ def envelope(
         from jaxbeam.files.tables import write_table
 
         write_table(output, {k: np.array(v) for k, v in columns.items()}, options.overwrite)
-    heads = "section", "lowest", "under", "highest", "under"
+    heads = "section", "unit", "lowest", "under", "highest", "under"
     heads += ("dynamic lowest", "highest") if velocity is not None else ()
-    lines = ["extremes in SI units, and the place of the vehicle:", *table(heads, rows)]
+    lines = ["extremes, and the place of the vehicle:", *table(heads, rows)]
     options.report(columns, lines, output)
 
 
@@ -238,6 +242,8 @@ def combine(
     )
 
     from jaxbeam.analysis.combinations import combine as combine_actions
+    from jaxbeam.case.display import text_scale
+    from jaxbeam.model.statics import unit_of_effect
 
     columns: dict[str, list] = {}
     rows = []
@@ -245,6 +251,7 @@ def combine(
         places, x = _sections(parsed_case, name, at)
         found = combine_actions(parsed_case, **tables, x=x, quantity=name)
         low, high = found.lowest, found.highest
+        scale = text_scale([low, high], unit_of_effect(name))
         for i, place in enumerate(found.positions):
             label = places.get(float(place), "")
             worst = int(low[:, i].argmin()), int(high[:, i].argmax())
@@ -255,18 +262,20 @@ def combine(
             for head, value in entry.items():
                 columns.setdefault(head, []).append(value)
             largest = max(-low.min(), high.max())
-            extremes = (_text(one, largest) for one in (low[worst[0], i], high[worst[1], i]))
+            extremes = (
+                _text(one, largest, scale.factor) for one in (low[worst[0], i], high[worst[1], i])
+            )
             by = (found.names[k] for k in worst)
             pairs = (text for pair in zip(extremes, by, strict=True) for text in pair)
-            rows.append((f"{name} at {label or f'{place:g} m'}", *pairs))
+            rows.append((f"{name} at {label or f'{place:g} m'}", scale.unit, *pairs))
     if output:
         import numpy as np
 
         from jaxbeam.files.tables import write_table
 
         write_table(output, {k: np.array(v) for k, v in columns.items()}, options.overwrite)
-    heads = "section", "lowest", "combination", "highest", "combination"
-    lines = ["design values in SI units, and the combination of each:", *table(heads, rows)]
+    heads = "section", "unit", "lowest", "combination", "highest", "combination"
+    lines = ["design values, and the combination of each:", *table(heads, rows)]
     options.report(columns, lines, output)
 
 
@@ -355,12 +364,12 @@ def influence(
 
 
 def _value_and_place(found, values, index) -> tuple[str, str]:
-    return _text(values[index], abs(values).max(), 6), f"{found.positions[index]:.6g}"
+    return _text(values[index], abs(values).max(), digits=6), f"{found.positions[index]:.6g}"
 
 
-def _text(value, largest, digits: int = 5) -> str:
-    """A value of a quantity with so many digits, or 0 if it is round-off of the largest."""
-    return "0" if abs(value) < ZERO * largest else f"{value:.{digits}g}"
+def _text(value, largest, factor: float = 1.0, digits: int = 5) -> str:
+    """A value over a factor with so many digits, or 0 if it is round-off of the largest."""
+    return "0" if abs(value) < ZERO * largest else f"{value / factor:.{digits}g}"
 
 
 def check(case: Path, /, *, options: ReadingOptions = ReadingOptions()) -> None:
