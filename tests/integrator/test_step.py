@@ -1,14 +1,20 @@
-"""Steps without commands: as maps, and one operation after the other."""
+"""Steps: as maps, one operation after the other, of many states, of modes without coupling."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.integrator import step_matrices
 from jaxbeam.integrator.step import advance, advance_unforced
 from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.integrator.vehicles import StepInput
+from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.differences import plan_of
 
@@ -142,3 +148,97 @@ def test_reverse_mode_stores_states_and_forces_of_each_step_only():
         return jax.jit(jax.grad(misfit)).lower(0.5).compile().memory_analysis().temp_size_in_bytes
 
     assert (memory(3201) - memory(1601)) / 1600 < 8 * 40
+
+
+CASE = jb.Case(
+    jb.Beam(1.2, 11.68, 0.535, 0.02, modes=5),
+    sensors=[jb.Sensor(0.45)],
+    loads=[
+        jb.MovingMass(mass=0.3, speed=6.0),
+        jb.MovingForce(mass=0.2, speed=-5.0, entry_time=0.01),
+    ],
+    run=jb.Run(0.2, sample_rate=100.0),
+)
+CASES = {
+    "one block a mode": CASE,
+    "coupled modes": jb.Case(
+        CASE.beam,
+        supports=[jb.Support(0.7, stiffness=500.0, damping=20.0)],
+        sensors=CASE.sensors,
+        loads=CASE.loads,
+        run=CASE.run,
+    ),
+    "without inertia": jb.Case(CASE.beam, sensors=CASE.sensors, loads=CASE.loads[1:], run=CASE.run),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_both_ways_give_the_same_run(name, monkeypatch):
+    by_matrices = jb.simulate(CASES[name])
+    monkeypatch.setattr(step_matrices, "MANY_STATES", 0)
+    by_forces = jb.simulate(CASES[name])
+    assert by_forces.steps == by_matrices.steps
+    for field in ("coordinates", "contact_force", "peak_deflection", "lowest_contact_force"):
+        found, expected = getattr(by_forces, field), getattr(by_matrices, field)
+        assert_allclose(found, expected, rtol=1e-9, atol=1e-11 * np.abs(expected).max())
+
+
+def test_many_modes_take_no_matrix_of_all_states(monkeypatch):
+    """Chunks of steps are as long as their largest matrices, of rows and states, allow."""
+    lengths, chunk_length = [], step_matrices.chunk_length
+
+    def recorded(*arguments):
+        lengths.append(chunk_length(*arguments))
+        return lengths[-1]
+
+    monkeypatch.setattr("jaxbeam.integrator.integrate.chunk_length", recorded)
+    case = jb.replace(CASES["without inertia"], {"run.duration": 0.001, "run.sample_rate": 1e6})
+    jb.simulate(jb.Case(jb.Beam(1.2, 11.68, 0.535, modes=80), loads=case.loads, run=case.run))
+    monkeypatch.setattr(step_matrices, "MANY_STATES", 10**9)
+    jb.simulate(jb.Case(jb.Beam(1.2, 11.68, 0.535, modes=80), loads=case.loads, run=case.run))
+    assert max(lengths) > 5 * min(lengths)
+
+
+BEAM = jb.Beam(1.2, 12.0, 0.5, damping_ratio=0.02, modes=4)
+LOADS = [jb.MovingMass(mass=0.2, speed=3.0)]
+COUPLED = jb.Case(BEAM, [jb.Support(0.5)], sensors=[jb.Sensor(0.3)], loads=LOADS, run=jb.Run(0.5))
+
+
+def with_support(**parts) -> jb.Case:
+    return dataclasses.replace(COUPLED, supports=(jb.Support(0.5, **parts),))
+
+
+@pytest.mark.parametrize(
+    ("parts", "coupled"),
+    [
+        ({}, False),
+        ({"stiffness": 4e3}, False),
+        ({"stiffness": 4e3, "mass": 0.1, "rotational_stiffness": 2.0}, False),
+        ({"damping": 0.0}, False),  # of a rigid support, which does not move
+        ({"stiffness": 4e3, "damping": 5.0}, True),
+        ({"stiffness": 4e3, "damping": 0.0}, True),  # it has derivatives
+    ],
+)
+def test_dampers_couple_the_modes(parts, coupled):
+    assert static_shapes(with_support(**parts)).coupled == coupled
+
+
+@pytest.mark.parametrize("parts", [{}, {"stiffness": 4e3}])
+def test_runs_are_the_same_with_one_block_and_with_many(parts):
+    case = with_support(**parts)
+    plan = integration_plan(case)
+    coupled = dataclasses.replace(plan, shapes=dataclasses.replace(plan.shapes, coupled=True))
+    found, expected = (jb.simulate(case, plan=one) for one in (plan, coupled))
+    scale = np.abs(expected.deflection).max()
+    assert_allclose(found.deflection, expected.deflection, rtol=0, atol=1e-10 * scale)
+
+
+def test_a_damper_that_is_left_out_has_no_address():
+    with pytest.raises(ValueError, match="'supports.0.damping', as it is left out there: give"):
+        jb.replace(COUPLED, {"supports.0.damping": 1.0})
+
+
+def test_a_damper_of_a_rigid_support_is_refused():
+    with pytest.raises(ValueError, match=r"supports.0.damping would have no effect.*rigid"):
+        jb.simulate(with_support(damping=3.0))

@@ -33,7 +33,7 @@ from jaxbeam.plot import (
 from jaxbeam.plot.drawing import drawn_vehicle, vehicle_art
 from jaxbeam.plot.style import INK, format_number, separate_labels, unit_scale
 from tests.plot.figures import CASE, CASE as BALL, MANY, data, lines_of, words
-from tests.simulation.vehicles.test_vehicle_record import WAGON
+from tests.simulation.test_vehicles import WAGON
 
 
 @pytest.fixture(scope="module")

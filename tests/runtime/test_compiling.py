@@ -1,5 +1,6 @@
-"""Compiled functions, alone and within others; options that XLA does not know."""
+"""Compiled functions, alone and within others, and functions whose latest results are kept."""
 
+import dataclasses
 import logging
 import os
 import subprocess
@@ -15,6 +16,7 @@ import jaxbeam as jb
 from jaxbeam.runtime import cache_folder, compiling, native_library
 from jaxbeam.runtime.arrays import fori_loop, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.memory import KEPT_RESULTS, remembered
 
 POINTS = np.array([0.1, 0.7, 2.0])
 
@@ -206,3 +208,46 @@ def test_nothing_is_logged_by_default():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+BEAM = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+KEPT = jb.Case(BEAM, sensors=[jb.Sensor(0.3)])
+
+
+def counted():
+    """A remembered function, and the trees of which it was computed."""
+    computed = []
+
+    @remembered
+    def function(tree):
+        computed.append(tree)
+        return len(computed)
+
+    return function, computed
+
+
+def test_equal_contents_are_computed_once():
+    function, computed = counted()
+    again = jb.replace(KEPT, {"beam.length": 0.6})
+    assert again is not KEPT and function(KEPT) == function(again) == 1 and len(computed) == 1
+
+
+def test_other_contents_are_computed():
+    """Other numbers, another structure, another shape with the same bytes, another class."""
+    function, _ = counted()
+    others = (
+        KEPT,
+        jb.replace(KEPT, {"beam.length": np.nextafter(0.6, 1.0)}),
+        dataclasses.replace(KEPT, sensors=(*KEPT.sensors, jb.Sensor(0.2))),
+        dataclasses.replace(KEPT, sensors=(jb.Sensor(0.3, quantity="velocity"),)),
+    )
+    assert [function(other) for other in others] == [1, 2, 3, 4]
+    one, two = np.zeros((1, 2)), np.zeros((2, 1))
+    assert (function(one), function(two), function([two])) == (5, 6, 7)
+
+
+def test_few_results_are_kept():
+    function, computed = counted()
+    for number in (*range(KEPT_RESULTS + 1), 0):
+        function(float(number))
+    assert len(computed) == KEPT_RESULTS + 2

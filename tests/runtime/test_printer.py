@@ -1,13 +1,15 @@
-"""Tables at any width, and the views of results: of notebooks, pandas and files."""
+"""Tables at any width, labelled datasets, and views of results of notebooks, pandas and files."""
 
 import csv
 import functools
 import html
+import subprocess
 import sys
 
 import hypothesis
 import numpy as np
 import pytest
+import xarray
 from hypothesis import strategies
 
 import jaxbeam as jb
@@ -16,7 +18,7 @@ from jaxbeam.analysis.compare import compare
 from jaxbeam.analysis.sections import Envelope
 from jaxbeam.cli import main
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.printer import html_table, terminal_width, text_table
+from jaxbeam.runtime.printer import html_table, labelled_dataset, terminal_width, text_table
 from tests.modules import DATA, ROOT
 from tuning.control.tuning_result import RunSetResult
 from tuning.parameters import FreeParameter
@@ -225,3 +227,43 @@ def test_units_are_not_broken():
     for width in (20, 28, 40):
         text = "\n".join(text_table(("sensor", "quantity", "least (N m)"), rows, width=width))
         assert "moment" in text and text.count("(N m)") == 2, text
+
+
+VARIABLES = {
+    "peak": (("speed", "sensor"), np.arange(6.0).reshape(3, 2), {"units": "m"}),
+    "count": ("speed", np.arange(3)),
+    "unit": ((), 4.0, {"units": "1"}),
+    "failed": (("speed",), np.array([True, False, False]), {"long_name": "whether the run failed"}),
+}
+COORDINATES = {
+    "speed": ("speed", np.array([1.0, 3.0, 2.0]), {"units": "m/s"}),
+    "sensor": ("sensor", np.array(["midspan", "end"])),
+    "position": ("sensor", [0.5, 1.0], {"units": "m"}),
+    "place": ("place", np.array(["a", "bc"], object)),
+    "mode": ("mode", np.arange(1, 4)),
+}
+
+
+def test_the_dataset_is_that_of_xarray():
+    found = labelled_dataset(VARIABLES, COORDINATES, {"title": "a beam"})
+    expected = xarray.Dataset(VARIABLES, COORDINATES, {"title": "a beam"})
+    xarray.testing.assert_identical(found, expected)
+    assert str(found) == str(expected)
+    assert {name: one.dtype for name, one in found.variables.items()} == {
+        name: one.dtype for name, one in expected.variables.items()
+    }
+    assert all(
+        type(one.to_index()) is type(expected[n].to_index())
+        for n, one in found.coords.items()
+        if one.ndim
+    )
+    assert found.sel(speed=2.0, sensor="end").peak == 5.0
+
+
+def test_no_package_of_other_arrays_is_imported():
+    program = (
+        "import sys; from jaxbeam.runtime.printer import labelled_dataset;"
+        "labelled_dataset({'a': ('x', [1.0])}, {'x': ('x', [2.0]), 'name': ('x', ['b'])});"
+        "assert not {'dask', 'pint', 'cupy', 'sparse'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
