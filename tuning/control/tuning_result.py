@@ -289,6 +289,14 @@ def _start_lines(minima: tuple[StartResult, ...]) -> list[str]:
     return lines
 
 
+def _of_case(case: Case, address: str) -> str:
+    """The number of the case at an address that a run leaves as it is; a dash for a count."""
+    try:
+        return f"{float(value_at(case, address)):.4g}"
+    except ValueError:
+        return "-"
+
+
 def _run_table(case: Case, run_set: RunSetResult) -> list[str]:
     """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
     varied = value_columns(run_set.runs)
@@ -306,7 +314,10 @@ def _run_table(case: Case, run_set: RunSetResult) -> list[str]:
         peaks["least"] = run_set.least_peaks
     rows = [
         [
-            *(f"{column[i]:.4g}" for column in varied.values()),
+            *(
+                _of_case(case, name) if np.isnan(column[i]) else f"{column[i]:.4g}"
+                for name, column in varied.items()
+            ),
             *(f"{1e3 * own[i]:.4f}" for own in peaks.values()),
             *(f"{own[i]:.1%}" for own in shares.values()),
         ]

@@ -40,7 +40,7 @@ def result(peak_after: float, peak_before: float = 0.9, **objective) -> TuningRe
         metrics,
         {"peak": peak_before, "rms": 0.7, "effort": 0.1},
     )
-    case = jb.Case(jb.Beam(0.6, 11.68, 0.535))
+    case = jb.Case(jb.Beam(0.6, 11.68, 0.535), loads=[jb.MovingMass(mass=0.5, speed=1.25)])
     return TuningResult(
         case, [], np.zeros(0), tuning.Objective(**objective), np.zeros((1, 1)), 0, [outcome]
     )
@@ -50,6 +50,24 @@ def test_peaks_above_no_control_are_called_so():
     assert "peak 8.8% above no control (10.0% below no control before" in result(1.088).verdict
     assert "peak 8.8% below no control (10.0% before tuning)" in result(0.912).verdict
     assert "peak 8.8% above no control (20.0% before tuning)" in result(1.088, 1.2).verdict
+
+
+def test_a_run_that_leaves_a_number_shows_that_of_the_case():
+    """A speed that only one of two runs sets was printed as nan."""
+    two = dataclasses.replace(
+        result(0.9).run_sets[0],
+        runs=({"loads.0.mass": 0.3}, {"loads.0.speed": 2.5, "profile.seed": 7}),
+        uncontrolled_peaks=np.ones(2),
+        peaks_before=np.ones(2),
+        peaks_after=np.ones(2),
+        least_peaks=np.full(2, np.nan),
+        saturated_share=np.zeros(2),
+    )
+    road = jb.profiles.ISO8608Profile("A", seed=3)
+    case = dataclasses.replace(result(0.9).case, profile=road)
+    own = dataclasses.replace(result(0.9), case=case, run_sets=[two])
+    first, second = (line.split()[:3] for line in str(own).splitlines() if "1000.0000" in line)
+    assert first == ["0.3", "1.25", "-"] and second == ["0.5", "2.5", "7"]
 
 
 def test_the_metrics_that_were_tuned_are_shown():
