@@ -10,9 +10,11 @@ that
     p >= 0,   u + (1 / m + S S') p >= 0,   and for each wheel one of both is zero.
 
 The energy of these velocities falls; the drive that keeps a wheel at its speed does the work
-p x' (w_x + r'). With a spring of contact, and for wheels that stand on a tyre, there is no impact:
-forces begin at zero at landing, or at what a damper of the tyre makes of the speed of approach.
-The lower end of a tyre in flight has no mass and relaxes on spring and damper.
+p x' (w_x + r'). A wheel that would rise after an impact by less than the rounding of gaps is held
+on the surface, u = 0, or impacts would follow each other ever faster without end. With a spring of
+contact, and for wheels that stand on a tyre, there is no impact: forces begin at zero at landing,
+or at what a damper of the tyre makes of the speed of approach. The lower end of a tyre in flight
+has no mass and relaxes on spring and damper.
 """
 
 import abc

@@ -352,20 +352,29 @@ class _LiftingRun:
     def impact(self, steps: Steps, i: int, point: int) -> Float[np.ndarray, " wheel"]:
         """Impulses (N s) of an inelastic impact of the rigid wheels that touch the surface.
 
-        They change the velocities of wheels and beam; wheels without an impulse lift.
+        They change the velocities of wheels and beam. Wheels that rise without an impulse lift, but
+        for those that would rise by less than the rounding of gaps: these are held on the surface.
         """
-        law, touching = self.law, self.law.rigid & self.pressing
-        index, impulses = np.flatnonzero(touching), np.zeros(self.count)
-        shape, rates = steps.at.shape[i, point, index], law.rate_index[index]
-        relative = self.e[rates] - self.surface(steps, i, point)[1, index]
+        law, at = self.law, Instants(*(part[i, point] for part in steps.at))
+        index, impulses = np.flatnonzero(law.rigid & self.pressing), np.zeros(self.count)
+        shape, rates, held = at.shape[index], law.rate_index[index], law.held[index]
         mobility = np.diag(1 / law.mass[index]) + shape @ shape.T
-        found = impulses_of(mobility, relative, law.held[index])
-        self.e[rates] += found / law.mass[index]
-        self.state[self.model.rate_index] -= shape.T @ found
-        after = relative + mobility @ found
-        for wheel in index[(after > self.rate_scale) & ~law.held[index]].tolist():
+        inertia = np.diag(np.linalg.inv(mobility))  # of one wheel while the others press
+        while True:
+            relative = self.e[rates] - self.surface(steps, i, point)[1, index]
+            found = impulses_of(mobility, relative, held)
+            self.e[rates] += found / law.mass[index]
+            self.state[self.model.rate_index] -= shape.T @ found
+            impulses[index] += found
+            after = relative + mobility @ found
+            rising = (after > self.rate_scale) & ~held
+            force = at.forces(law, self.pressing, self.state, self.e)[index]
+            low = rising & (inertia * after**2 / 2 < force * self.gap_scale)
+            if not low.any():
+                break
+            held = held | low
+        for wheel in index[rising].tolist():
             self.lift(wheel, steps, i, point)
-        impulses[index] = found
         return impulses
 
     def flights(self) -> Flights:

@@ -15,6 +15,7 @@ from jaxbeam import rigs
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.unilateral import impulses_of
 from tests.oracles.lifting_wheels import Crossing, Wheel
+from tests.oracles.moreau_steps import moreau_steps
 
 UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0, "damping_ratio": 0.02}
 LIFTING = jb.UnilateralContact()
@@ -328,18 +329,48 @@ def test_mass_of_fig_2_27_flies():
 
 
 @pytest.mark.filterwarnings("ignore::jaxbeam.model.plausibility.check.PlausibilityWarning")
-def test_a_wheel_that_another_throws_up_does_not_land_while_it_rises():
+@pytest.mark.parametrize(("modes", "duration"), [(2, 0.20702), (6, 0.5)])
+def test_a_wheel_that_another_throws_up_does_not_land_while_it_rises(modes, duration):
     """A landing wheel throws the other up, slowly: its flight is far shorter than a step."""
     case = jb.Case(
         jb.Beam(
-            50.0, 4e9, 4e3, damping_ratio=0.01, modes=2, shear_stiffness=1e9, rotary_inertia=3e3
+            50.0, 4e9, 4e3, damping_ratio=0.01, modes=modes, shear_stiffness=1e9, rotary_inertia=3e3
         ),
         supports=[jb.Support(25.0)],
         loads=[jb.MovingMass(9000.0, 42.0), jb.MovingMass(3000.0, 42.0, entry_time=0.2)],
         contact=LIFTING,
-        run=jb.Run(0.20702, sample_rate=1000.0),
+        run=jb.Run(duration, sample_rate=1000.0),
     )
     flights = jb.simulate(case).flights
     assert flights.wheel[0] == 1 and 1 < flights.wheel.size < 30
     landed = ~np.isnan(flights.landing_time)
     assert np.all(flights.approach_speed[landed] > 0) and np.all(flights.impulse[landed] > 0)
+
+
+def test_impacts_that_follow_each_other_ever_faster_come_to_an_end():
+    """Three masses throw each other up; Moreau's time steps approach the run as they shorten."""
+    speed, masses = 1.27, np.array([0.13, 0.22, 0.51])
+    starts, duration = np.array([0.0, -0.21, -0.42]), 1.3 / 1.27
+    loads = [
+        jb.MovingMass(mass, speed, entry_time=-start / speed)
+        for mass, start in zip(masses.tolist(), starts.tolist(), strict=True)
+    ]
+    case = jb.Case(
+        jb.Beam(**UNIT, modes=3),
+        sensors=[jb.Sensor(0.5)],
+        loads=loads,
+        contact=LIFTING,
+        run=jb.Run(duration, sample_rate=64 / duration, gravity=G),
+    )
+    record = jb.simulate(case)
+    assert 10 < record.flights.wheel.size < 40
+    frequencies = np.pi**2 * np.arange(1, 4) ** 2
+    x = np.array([0.1, 0.37, 0.5, 0.81])
+    shapes = np.sqrt(2.0) * np.sin(np.pi * np.outer(np.arange(1, 4), x))
+    deflection, errors = np.asarray(record.at(x)), []
+    for every in (25, 100):
+        step = duration / (64 * every)
+        wheels = masses, masses * G, np.full(3, speed), starts
+        steps = moreau_steps(frequencies, 0.02, *wheels, duration, step, every)
+        errors.append(np.max(np.abs(steps @ shapes - deflection)) / np.max(np.abs(deflection)))
+    assert errors[1] < 3e-4 and errors[1] < errors[0] / 2.5
