@@ -4,8 +4,12 @@
 `sweep case.toml` over mass and speed, `identify rig.toml log_1.csv` for the flexural rigidity, and
 `export` of `regulator.toml` (gains, filter and estimator) and of `table.toml` (`--points 6`).
 Its fit was written anew by release 0.2.0, in `release_0_2_0`.
+
+Answers of cases of all kinds are those of version 0.2.0.
 """
 
+import json
+import pathlib
 import shutil
 from pathlib import Path
 
@@ -20,6 +24,7 @@ from jaxbeam.files.case_file import KindChangeWarning, with_settings
 from jaxbeam.files.export import export_gains, read_gains
 from jaxbeam.files.export.designed import ARRAYS
 from jaxbeam.simulation.stored_record import read_record
+from tests.simulation.release_cases import CASES, OTHER_STEPS, answers
 from tuning import load_fit, read_logs
 
 FOLDER = Path(__file__).parents[1] / "data" / "release_0_1_0"
@@ -158,3 +163,25 @@ def test_a_spring_to_ground_takes_no_gain_and_no_sensor():
     found, expected = jb.simulate(alone), jb.simulate(full)
     assert found.deflection[:, 0] == pytest.approx(expected.deflection[:, 1], abs=1e-12)
     assert not found.command[:, 0].any() and found.command[:, 1].any()
+
+
+KEPT = json.loads((pathlib.Path(__file__).parents[1] / "data/release_0_2_0.json").read_text())
+TOLERANCE = 1e-9  # relative to the largest entry of each array
+pytestmark = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_answers_are_those_of_version_0_2_0(name):
+    found = answers(name)
+    assert found.keys() == KEPT[name].keys()
+    for part, kept in KEPT[name].items():
+        ours, theirs = np.array(found[part], float), np.array(kept, float)
+        scale = np.max(np.abs(theirs), initial=0.0, where=np.isfinite(theirs))
+        assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE * scale, err_msg=part)
+
+
+@pytest.mark.parametrize("name", OTHER_STEPS)
+def test_peaks_of_other_steps_differ_by_the_stated_error(name):
+    record, kept = jb.simulate(CASES[name]), np.array(KEPT[name]["peaks"])
+    stated = 1.5 * float(record.error_estimate) * kept.max()
+    assert_allclose(record.peak_deflection, kept, rtol=0, atol=stated)

@@ -1,8 +1,13 @@
-"""Blocks of sweeps are sized by memory: what they take, and the same results whatever they take."""
+"""Blocks of sweeps are sized by memory: what they take, and the same results whatever they take.
+
+Memory that is free, and the part of it that blocks take.
+"""
 
 import dataclasses
 import errno
 import os
+import subprocess
+import sys
 import tracemalloc
 
 import numpy as np
@@ -11,6 +16,8 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.runtime import memory
+from jaxbeam.runtime.memory import block_memory, free_memory, size_text
 from jaxbeam.sweeps import computation
 from jaxbeam.sweeps.blocks import SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, LEAST_BYTES, PHASE
@@ -93,12 +100,12 @@ def test_the_number_of_runs_falls_with_memory():
     """A beam with many corrected sensors under many heavy wheels, and one with long histories."""
     many = case_of(UNIFORM, HEAVY, "moment", 161)
     batches = {}
-    for memory in ("64 GB", "2 GB"):
-        plan = plan_of(many, memory)
+    for size in ("64 GB", "2 GB"):
+        plan = plan_of(many, size)
         assert plan._sizes.batch_bytes(many.sensors[:1], 1) < plan.block_bytes
         sensors = [many.sensors[i] for i in plan.sensor_groups[0]]
-        batches[memory] = len(plan.sensor_groups), plan._sizes.batch_bytes(sensors, 1)
-        assert batches[memory][1] <= plan.block_bytes
+        batches[size] = len(plan.sensor_groups), plan._sizes.batch_bytes(sensors, 1)
+        assert batches[size][1] <= plan.block_bytes
     assert batches["64 GB"][0] < batches["2 GB"][0]
     long = dataclasses.replace(
         case_of(UNIFORM, jb.MovingMass(mass=100.0, speed=50.0), "deflection", 3),
@@ -204,3 +211,43 @@ def test_collecting_onto_a_full_disk_keeps_the_blocks(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(OSError, match="finished blocks are kept: mend this, then resume"):
         store.collect(1, np.array([[0, 1]]))
+
+
+@pytest.mark.parametrize(
+    ("given", "size"), [("2 GB", 2e9), ("512MiB", 2.0**29), (3e8, 3e8), ("1e9", 1e9)]
+)
+def test_memory_as_given(given, size):
+    assert block_memory(given) == size
+
+
+@pytest.mark.parametrize("given", ["2 apples", "-1", 0, "1e999", True, [1]])
+def test_no_memory(given):
+    with pytest.raises(ValueError, match="a number of bytes or a text as '2 GB'"):
+        block_memory(given)
+
+
+def test_a_quarter_of_what_is_free_by_default():
+    assert block_memory() == pytest.approx(free_memory() / 4, rel=0.2)
+    assert size_text(1.53e9) == "1.53 GB" and size_text(2e4) == "20 kB"
+
+
+def test_containers_limit_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
+    (tmp_path / "memory.max").write_text("1000000\n")
+    (tmp_path / "memory.current").write_text("700000\n")
+    (tmp_path / "memory.stat").write_text("anon 500000\ninactive_file 200000\n")
+    assert free_memory() == 500_000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_memory() > 1e7
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_limits_of_the_process():
+    program = (
+        "import resource, jaxbeam.runtime.memory as m;"
+        "resource.setrlimit(resource.RLIMIT_AS, (8 * 2**30, 8 * 2**30));"
+        "a = m.free_memory(); b = bytearray(2**27); print(a, a - m.free_memory())"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    free, taken = map(float, found.stdout.split())
+    assert free < 8 * 2**30 and taken > 2**26

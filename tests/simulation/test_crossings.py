@@ -1,21 +1,61 @@
-"""Random crossings against the modal equations, integrated by scipy: deflections and stated errors.
+"""Crossings against the closed form of a moving force and integrations by scipy.
+
+Random crossings against the modal equations, integrated by scipy: deflections and stated errors.
 
 Masses to a hundred times the beam's and speeds to ten times the critical one; one to eight modes;
 loads that enter together, follow, meet or stop on the beam.
 """
 
+import dataclasses
 import warnings
 
+import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
+from tests.differences import assert_close, plan_of
 from tests.fuzzing import examples
 from tests.oracles import modal_equations
-from tests.oracles.crossing import Load
+from tests.oracles.closed_forms import (
+    critical_speed,
+    moving_force,
+)
+from tests.oracles.crossing import GRAVITY, Load
+from tests.simulation.pinned_span import SENSORS, SPAN, case_of
+
+
+@pytest.fixture(scope="module")
+def one_force():
+    """Function that simulates a force of 3 N on the undamped span for two crossing times."""
+    case = case_of(UNDAMPED, [Load(3.0 / GRAVITY, 1.0, kind="force")])
+    plan = plan_of(case)
+
+    def run(speed):
+        times = np.linspace(0.0, 2 * SPAN.length / speed, 101)
+        return jb.simulate(jb.replace(case, {"loads.0.speed": speed}), jnp.asarray(times), plan)
+
+    return run
+
+
+UNDAMPED = dataclasses.replace(SPAN, damping_ratio=0.0)
+
+
+@pytest.mark.filterwarnings(
+    # the model is bilateral, the oracles too
+    "ignore::jaxbeam.simulation.simulate.ContactLossWarning"
+)
+@pytest.mark.parametrize("ratio", [0.05, 0.3, 1.0, 1.0 + 1e-9, 2.0, 3.7])
+def test_moving_force_has_its_closed_form_at_every_speed(one_force, ratio):
+    record = one_force(ratio * critical_speed(UNDAMPED))
+    q, u = moving_force(UNDAMPED, 3.0, ratio * critical_speed(UNDAMPED), np.asarray(record.times))
+    assert_close(record.deflection, q @ UNDAMPED.shapes(np.array(SENSORS)).T, 1e-10)
+    assert_close(record.velocity, u @ UNDAMPED.shapes(np.array(SENSORS)).T, 1e-10)
+
 
 LENGTH, RIGIDITY, MASS_PER_LENGTH = 2.0, 50.0, 1.5
 CRITICAL_SPEED = np.pi / LENGTH * np.sqrt(RIGIDITY / MASS_PER_LENGTH)  # of the first mode, m/s
@@ -51,7 +91,7 @@ def crossings(draw) -> tuple[modal_equations.Span, list[Load], float]:
     return span, loads, max(ends) + draw(st.sampled_from([0.1, 2.0])) * PERIOD
 
 
-def case_of(span, loads, duration) -> jb.Case:
+def crossing_case(span, loads, duration) -> jb.Case:
     """The same crossing in jaxbeam."""
     kinds = {"mass": jb.MovingMass, "force": jb.MovingForce}
     return jb.Case(
@@ -78,7 +118,7 @@ def test_deflections_agree_with_scipy_within_the_stated_error(crossing):
     span, loads, duration = crossing
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
-        record = jb.simulate(case_of(span, loads, duration))
+        record = jb.simulate(crossing_case(span, loads, duration))
     positions = np.array([0.37, 0.5]) * LENGTH
     expected = modal_equations.respond(span, loads, positions, np.asarray(record.times)).deflection
     size = np.abs(expected).max()
