@@ -471,7 +471,8 @@ OF_LOADS = "loads.0.mass", "run.gravity"
 OF_PATHS = "loads.0.speed", "loads.0.entry_time"
 # Those that have the loads in their model; all others share a design over masses.
 WITH_LOADS = {
-    *("feedback-scheduled", "feedback-stepped", "kalman-known", "kalman-extended"),
+    *("feedback-scheduled", "feedback-scheduled-at-a-sample", "feedback-stepped"),
+    *("kalman-known", "kalman-extended"),
     *("moving-horizon", "table", "family", "position", "position-followed", "nearest"),
     *("mpc-varying", "mpc-estimated"),
 }
