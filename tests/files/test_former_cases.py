@@ -167,9 +167,10 @@ def test_a_spring_to_ground_takes_no_gain_and_no_sensor():
 
 KEPT = json.loads((pathlib.Path(__file__).parents[1] / "data/release_0_2_0.json").read_text())
 TOLERANCE = 1e-9  # relative to the largest entry of each array
-pytestmark = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+bilateral = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 
 
+@bilateral
 @pytest.mark.parametrize("name", CASES)
 def test_answers_are_those_of_version_0_2_0(name):
     found = answers(name)
@@ -180,6 +181,7 @@ def test_answers_are_those_of_version_0_2_0(name):
         assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE * scale, err_msg=part)
 
 
+@bilateral
 @pytest.mark.parametrize("name", OTHER_STEPS)
 def test_peaks_of_other_steps_differ_by_the_stated_error(name):
     record, kept = jb.simulate(CASES[name]), np.array(KEPT[name]["peaks"])
