@@ -46,7 +46,10 @@ from jaxbeam.runtime.arrays import (
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
 FEW_STEPS = 16  # of one length, below which a call takes longer than their own propagators
 MANY_STATES = 48  # from which NumPy makes no matrix of all states for a step
-PREPARED_ENTRIES = 2**25  # entries of the largest matrix of all steps of a prepared run: 0.3 GB
+# Entries of the largest matrix of all steps of a prepared run: 67 MB. The runs and derivatives of a
+# batch multiply it: with 0.3 GB, the tuning of an absorber under a train of 50 axles, three runs
+# and two parameters, took 11 GB and 2.5 times as long. Single runs take as long with either.
+PREPARED_ENTRIES = 2**23
 NUMPY_CHUNK_ENTRIES = 2**19  # entries of matrices that NumPy computes together, to fit in caches
 
 
@@ -145,7 +148,9 @@ def chunk_length(
         monitored = discrete.monitored_transition.shape[1] * (states + rows)
     entries = max(of_matrices, batch * (rows + states), monitored)
     if prepared:
-        return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
+        # Compliances of springs, of deflection and velocity, have no factors.
+        largest = max(entries, 2 * rows**2 if loads.wheels.vehicles else 0)
+        return prepared if prepared * largest <= PREPARED_ENTRIES else CHUNK_STEPS
     if any_jax(loads):
         return CHUNK_STEPS
     return int(max(1, min(discrete.grid.step_count, NUMPY_CHUNK_ENTRIES // entries)))
