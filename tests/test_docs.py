@@ -33,7 +33,7 @@ from jaxbeam.case.track import Track
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.json_schema import tables
 from tests.modules import ROOT
-from tuning.control.load_cases import read_load_cases
+from tuning.control.run_set import read_load_cases
 
 NAME = r"(?:(?:de|De|Van|Van der) )*[A-Z][a-z][\w-]+"
 # "Peeters and De Roeck 1999", "Neu et al. 2017", "Clarke, Mohtadi and Tuffs, Automatica 23, 1987".

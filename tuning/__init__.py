@@ -8,10 +8,10 @@ import os
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
 from tuning import control, fit, logs, modal, monitoring, weighing
-from tuning.control.load_cases import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.objective import Objective
 from tuning.control.pareto import pareto
 from tuning.control.penalised_objective import StabilityConstraint
+from tuning.control.run_set import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.tune import tune
 from tuning.control.tuning_result import TuningResult
 from tuning.fit.experiment_design import design_experiment
@@ -21,8 +21,7 @@ from tuning.fit.modal_parameters import identify_from_modes
 from tuning.fit.result import load_fit, save_fit
 from tuning.logs.log import Log
 from tuning.logs.reading import read_log, read_logs
-from tuning.modal.fit import ModalFit
-from tuning.modal.identify_modes import ModalSettings, identify_modes
+from tuning.modal.identify_modes import ModalFit, ModalSettings, identify_modes
 from tuning.parameters import Prior
 from tuning.weighing.weigh import weigh
 

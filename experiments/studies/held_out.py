@@ -23,9 +23,8 @@ from experiments.thesis.cases import (
 from experiments.thesis.report import plot_commands, plot_deflections
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
-from tuning.control.load_cases import AddressValues
 from tuning.control.objective import with_fixed_design
-from tuning.control.run_set import make_run_set
+from tuning.control.run_set import AddressValues, make_run_set
 
 PERIOD = 0.01  # s, of sampling
 MASSES, ENTRY_TIME = (0.261, 0.509), 0.05  # kg, s: training

@@ -54,8 +54,8 @@ from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
-from tuning.control.load_cases import run_case
 from tuning.control.objective import with_fixed_design
+from tuning.control.run_set import run_case
 
 FOLDER = Path(__file__).parent / "controllers" / "sensor_feedback"
 DELAY = 0.02  # s

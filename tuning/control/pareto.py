@@ -19,9 +19,9 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.control.lqr import LQR
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.runtime.printer import text_table
-from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.penalised_objective import StabilityConstraint
+from tuning.control.run_set import LoadCases
 from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments, tune
 from tuning.control.tuning_result import TuningResult
 

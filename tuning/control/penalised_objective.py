@@ -14,9 +14,8 @@ from jaxbeam.case.case import Case, concrete_case, crossing_times, replace, stac
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
-from tuning.control.load_cases import AddressValues, run_cases
 from tuning.control.objective import Objective, WeightsAndLimits, with_fixed_design
-from tuning.control.run_set import RunSet
+from tuning.control.run_set import AddressValues, RunSet, run_cases
 from tuning.parameters import FreeParameter
 
 STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violation

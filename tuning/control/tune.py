@@ -20,11 +20,16 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, Histories
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
-from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.optimisation import Optimisation, OptimisationState, optimiser
 from tuning.control.penalised_objective import STABILITY_PENALTY_SLOPE, StabilityConstraint
-from tuning.control.run_set import RunSet, draw_plants, make_run_set, with_identified_plant
+from tuning.control.run_set import (
+    LoadCases,
+    RunSet,
+    draw_plants,
+    make_run_set,
+    with_identified_plant,
+)
 from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty import Posterior

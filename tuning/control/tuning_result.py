@@ -22,8 +22,8 @@ from jaxbeam.control.feedforward import hand_drawn_law
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
-from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case, value_columns
 from tuning.control.objective import Objective, with_fixed_design
+from tuning.control.run_set import PLANT_PREFIXES, AddressValues, run_case, value_columns
 from tuning.parameters import FreeParameter
 
 LIMIT_TOLERANCE = 0.01  # fraction of a limit by which it may be exceeded without a remark

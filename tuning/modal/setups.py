@@ -26,8 +26,8 @@ from scipy.stats import chi2
 
 from jaxbeam.case.fields import refuses_traced
 from tuning.logs.log import Log, even_records
-from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.measured_responses import without_forces
+from tuning.modal.identify_modes import Choice, ModalFit
 from tuning.modal.preprocessing import MAX_RATE_CHANGE, same_channels, with_channels
 from tuning.modal.result import (
     MIN_ENERGY,

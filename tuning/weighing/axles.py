@@ -20,9 +20,9 @@ from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.influence_lines import InfluenceLines, lines_for
-from tuning.weighing.matching_pursuit import MosesFit, moses
 from tuning.weighing.search import find_axles, most_likely, with_free_frequency
 from tuning.weighing.vehicles import MOST_EXCESS
+from tuning.weighing.weigh import MosesFit, moses
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from experiments.studies.one_law.plants import (
 )
 from experiments.studies.one_law.tune import CUTOFF, with_numbers
 from jaxbeam.runtime.printer import markdown_table
-from tuning.control.load_cases import AddressValues
+from tuning.control.run_set import AddressValues
 
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law_detuned.md"
 FACTORS = 0.8, 0.85, 1.0, 1.15  # of the rigidity as printed

@@ -30,8 +30,8 @@ from jaxbeam import rigs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import markdown_table
 from jaxbeam.simulation.simulate import ContactLossWarning
-from tuning.control.load_cases import AddressValues
 from tuning.control.objective import with_fixed_design
+from tuning.control.run_set import AddressValues
 
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law.md"
 CUTOFFS, DELAYS, FACTORS = (5.0, 10.0, 20.0, 40.0), (0.0, 0.02, 0.04), (0.8, 1.0, 1.2)  # Hz, s, -

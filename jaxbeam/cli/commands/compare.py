@@ -114,7 +114,7 @@ def compare(
 def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     """Report the controllers over the runs of a file."""
     from jaxbeam.analysis.compare import metrics_over_cases, worst_comparison
-    from tuning.control.load_cases import read_load_cases
+    from tuning.control.run_set import read_load_cases
     from tuning.control.tuning_result import compare_runs
 
     load_cases = read_load_cases(path, case)

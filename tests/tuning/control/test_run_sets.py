@@ -17,9 +17,8 @@ from jaxbeam.simulation.simulate import simulate_histories
 from tests.tuning.small_rig import GAIN as PLANT_GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import CASE as PLANT_CASE, fit
 from tuning.control import run_set
-from tuning.control.load_cases import run_case, run_cases
 from tuning.control.objective import with_fixed_design
-from tuning.control.run_set import make_run_set
+from tuning.control.run_set import make_run_set, run_case, run_cases
 from tuning.fit.uncertainty import Posterior
 
 GAIN = "controller.gains.0"

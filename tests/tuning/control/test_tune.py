@@ -17,10 +17,9 @@ from tests.differences import central
 from tuning import checkpoint
 from tuning.checkpoint import load, save
 from tuning.control import penalised_objective
-from tuning.control.load_cases import run_case
 from tuning.control.objective import Objective
 from tuning.control.optimisation import Optimisation
-from tuning.control.run_set import make_run_set
+from tuning.control.run_set import make_run_set, run_case
 from tuning.parameters import free_parameters
 
 GAIN = "controller.gains.0"

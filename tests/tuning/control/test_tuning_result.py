@@ -15,7 +15,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.control.feedforward import hand_drawn_law
 from jaxbeam.model.deflection_lines import influence_line
 from tests.tuning.small_rig import GAIN, rig
-from tuning.control.load_cases import run_case
+from tuning.control.run_set import run_case
 from tuning.control.tuning_result import (
     HAND_DRAWN,
     RunSetResult,

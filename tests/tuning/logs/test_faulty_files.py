@@ -14,7 +14,7 @@ import scipy.io
 
 import jaxbeam as jb
 from tuning import read_log, read_logs
-from tuning.control.load_cases import read_load_cases
+from tuning.control.run_set import read_load_cases
 from tuning.logs.log import Log, LogWarning, doubts
 from tuning.logs.readers.headings import seconds_of
 from tuning.logs.reading import read_description

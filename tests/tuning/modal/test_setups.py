@@ -11,8 +11,8 @@ from scipy.linalg import eigh
 from tests.oracles.planted_structures import Structure, beam_matrices, coloured_noise, response
 from tuning import Log, identify_modes
 from tuning.modal import merge_setups
-from tuning.modal.fit import ModalFit
 from tuning.modal.harmonics import Line
+from tuning.modal.identify_modes import ModalFit
 from tuning.modal.result import IdentifiedMode, mac_matrix
 from tuning.modal.setups import Part, logs_of_setups, whole_shape
 

@@ -21,8 +21,8 @@ from tuning.weighing import (
 from tuning.weighing.axle_fit import CrossingLog
 from tuning.weighing.axles import AxleWeighing
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict
-from tuning.weighing.matching_pursuit import moses
 from tuning.weighing.search import find_axles
+from tuning.weighing.weigh import moses
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5
 PLACES, DURATION, SPEED, LEAD = [LENGTH / 2, LENGTH / 4], 2.4, 18.0, 9.0

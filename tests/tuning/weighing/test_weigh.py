@@ -19,7 +19,7 @@ from tests.tuning.fit.test_identify import deviations, log_of as weighed_log_of,
 from tuning import Log, identify, weigh
 from tuning.weighing import calibrate_influence_lines, weigh_axles
 from tuning.weighing.influence_lines import UnitForce
-from tuning.weighing.matching_pursuit import MatchingPursuit
+from tuning.weighing.weigh import MatchingPursuit
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 TIMES = np.arange(301) / 250

@@ -1,4 +1,4 @@
-"""Formats of log files, one module each; a module with a `FORMAT` is a format.
+"""Formats of log files, a module for each family; each `LogFormat` in a module is a format.
 
 Each format reads a file into tables, one for each run. Files that are packed (.gz, .zip) are read
 like those in them.
@@ -28,7 +28,9 @@ __all__ = ["LogTable", "is_time_name", "parse_heading", "read_tables"]
 _MODULES = (
     importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)
 )
-FORMATS: tuple[LogFormat, ...] = tuple(m.FORMAT for m in _MODULES if hasattr(m, "FORMAT"))
+FORMATS: tuple[LogFormat, ...] = tuple(
+    found for m in _MODULES for found in vars(m).values() if isinstance(found, LogFormat)
+)
 _SUFFIXES = [suffix for log_format in FORMATS for suffix in log_format.suffixes]
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 

@@ -1,4 +1,4 @@
-"""MiniSEED (.mseed), by obspy: traces of seismic recorders, each with its own start and rate."""
+"""Evenly sampled series: sound files (.wav), as loggers write them, too, and MiniSEED (.mseed)."""
 
 import dataclasses
 import io
@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import scipy.io.wavfile
 
 from jaxbeam.files.endings import import_extra
 from tuning.logs.readers.table import (
@@ -16,6 +17,34 @@ from tuning.logs.readers.table import (
     read_bytes,
     table_of,
 )
+
+MAGICS = b"RIFF", b"RIFX", b"RF64"
+
+
+def read_wav(path: Path) -> dict[str, LogTable]:
+    """Table of the channels of a sound file, called channel 1, channel 2, ...
+
+    Whole numbers become fractions of the range, between -1 and 1; others stay as they are.
+
+    Raises ValueError for a damaged file.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of blocks that are not samples
+            rate, samples = scipy.io.wavfile.read(io.BytesIO(read_bytes(path)))
+    except Exception as error:  # scipy raises many types for damaged files
+        raise damaged_file_error(path, error) from None
+    values = np.asarray(samples, float).reshape(len(samples), -1)
+    if samples.dtype.kind == "u":  # of eight bits
+        values = (values - 128) / 128
+    elif samples.dtype.kind == "i":  # scipy puts three bytes into the upper ones of four
+        values = values / -float(np.iinfo(samples.dtype).min)
+    names = ("time", *(f"channel {i + 1}" for i in range(values.shape[1])))
+    table = np.column_stack([np.arange(len(values)) / rate, values])
+    return {"": LogTable(names, ("s", *[None] * values.shape[1]), table, time="time")}
+
+
+SOUND = LogFormat("sound", read_wav, suffixes=(".wav",), magics=MAGICS)
 
 
 def read_mseed(path: Path) -> dict[str, LogTable]:
@@ -54,4 +83,4 @@ def read_mseed(path: Path) -> dict[str, LogTable]:
     return {"": dataclasses.replace(table, start=start.datetime.isoformat())}
 
 
-FORMAT = LogFormat("MiniSEED", read_mseed, suffixes=(".mseed", ".miniseed"), magics=())
+MINISEED = LogFormat("MiniSEED", read_mseed, suffixes=(".mseed", ".miniseed"), magics=())
