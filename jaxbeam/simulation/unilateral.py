@@ -62,7 +62,8 @@ RATES = 1e2  # of the rounding of gaps times frequencies
 EXACT = 1e-2  # of ROUNDING: value at an event
 JUMP = 10.0  # of ROUNDING: a smaller one is none
 SAME_TIME = 1e-12  # of the duration of a run
-MAX_EVENTS = 20000
+MAX_EVENTS = 500  # of one wheel within a share of the run: impacts that end take some hundred
+EVENT_SHARE = 1e-2  # of the duration of a run
 MAX_TRIALS = 40  # cuts of a step until it ends at an event
 CHUNK_ENTRIES = 2**22  # of the largest array of the steps that are prepared together
 _OF_POINTS = np.linalg.inv(POINTS[:, None] ** np.arange(POINTS.size))
@@ -95,7 +96,7 @@ def run_unilateral(
 
     `events` are the times (s) of load events, at which velocities may jump.
 
-    Raises RuntimeError if there are too many events, as of a wheel that rebounds ever faster.
+    Raises RuntimeError if a wheel leaves and lands too often in too short a time.
     """
     return _LiftingRun(case, model, loads).over(grid, events)
 
@@ -126,7 +127,7 @@ class _LiftingRun:
         self.pieces: list[Piece] = []
         self.flying: dict[int, dict] = {}
         self.landed: list[dict] = []
-        self.switches = 0
+        self.events: list[list[float]] = [[] for _ in range(self.count)]  # times (s), by wheel
         self.force_scale, self.gap_scale, self.rate_scale = self.scales(case)
 
     def scales(self, case: Case) -> tuple[float, float, float]:
@@ -295,20 +296,22 @@ class _LiftingRun:
     def switch(self, wheel: int, steps: Steps, i: int, point: int) -> None:
         """Change a wheel from contact to flight, or back, at an end of a step.
 
-        Raises RuntimeError if events are too many.
+        Raises RuntimeError if events follow each other too fast.
         """
-        self.switches += 1
-        if self.switches > MAX_EVENTS:
+        time, position = self.place(wheel, steps, i, point)
+        events, share = self.events[wheel], EVENT_SHARE * self.duration
+        events.append(time)
+        if len(events) > MAX_EVENTS and time - events[-1 - MAX_EVENTS] < share:
             raise RuntimeError(
-                f"wheels leave and land more than {MAX_EVENTS} times: keep fewer modes"
-                " (beam.modes), or give the contact a spring (contact.hertz_stiffness)"
+                f"wheel {wheel} leaves and lands more than {MAX_EVENTS} times within {share:.3g} s,"
+                f" until {time:.6g} s, at {position:.6g} m: keep fewer modes (beam.modes), or give"
+                " the contact a spring (contact.hertz_stiffness)"
             )
         if self.pressing[wheel]:
             self.lift(wheel, steps, i, point)
             return
         law, (height, rate) = self.law, self.surface(steps, i, point)
         self.pressing[wheel], flight = True, self.flying.pop(wheel)  # an impact may lift it anew
-        time, position = self.place(wheel, steps, i, point)
         landing = {"landing_time": time, "landing_position": position}
         if law.rigid[wheel]:
             self.e[law.height_index[wheel]] = height[wheel]
@@ -354,6 +357,7 @@ class _LiftingRun:
 
         They change the velocities of wheels and beam. Wheels that rise without an impulse lift, but
         for those that would rise by less than the rounding of gaps: these are held on the surface.
+        Holding may pull, by as much as the weight would give in the flight that is left out.
         """
         law, at = self.law, Instants(*(part[i, point] for part in steps.at))
         index, impulses = np.flatnonzero(law.rigid & self.pressing), np.zeros(self.count)

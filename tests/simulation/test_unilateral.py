@@ -1,6 +1,7 @@
 """Unilateral contact: published numbers, scipy from event to event, impacts, what is refused."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from experiments.thesis.cases import critical_speed, two_spans, with_modes, with_sensors
 from jaxbeam import rigs
+from jaxbeam.simulation import unilateral as lifting
 from jaxbeam.simulation.integration_plan import integration_plan
-from jaxbeam.simulation.unilateral import impulses_of
 from tests.oracles.lifting_wheels import Crossing, Wheel
 from tests.oracles.moreau_steps import moreau_steps
 
@@ -258,7 +259,7 @@ def test_impulses_of_several_wheels():
         shapes = random.standard_normal((count, 3))
         mobility = np.diag(random.uniform(0.1, 3.0, count)) + shapes @ shapes.T
         relative, held = random.standard_normal(count), random.random(count) < 0.2
-        impulses = impulses_of(mobility, relative, held)
+        impulses = lifting.impulses_of(mobility, relative, held)
         after = relative + mobility @ impulses
         assert_allclose(after[held], 0.0, atol=1e-9)
         assert np.all(impulses[~held] >= 0) and np.all(after[~held] >= -1e-9)
@@ -347,22 +348,65 @@ def test_a_wheel_that_another_throws_up_does_not_land_while_it_rises(modes, dura
     assert np.all(flights.approach_speed[landed] > 0) and np.all(flights.impulse[landed] > 0)
 
 
-def test_impacts_that_follow_each_other_ever_faster_come_to_an_end():
-    """Three masses throw each other up; Moreau's time steps approach the run as they shorten."""
-    speed, masses = 1.27, np.array([0.13, 0.22, 0.51])
-    starts, duration = np.array([0.0, -0.21, -0.42]), 1.3 / 1.27
+def three_masses(modes=3):
+    """Three masses that throw each other up, with impacts ever faster; samples at 1/64."""
+    duration = 1.3 / 1.27
     loads = [
-        jb.MovingMass(mass, speed, entry_time=-start / speed)
-        for mass, start in zip(masses.tolist(), starts.tolist(), strict=True)
+        jb.MovingMass(0.13, 1.27),
+        jb.MovingMass(0.22, 1.27, entry_time=0.21 / 1.27),
+        jb.MovingMass(0.51, 1.27, entry_time=0.42 / 1.27),
     ]
-    case = jb.Case(
-        jb.Beam(**UNIT, modes=3),
+    return jb.Case(
+        jb.Beam(**UNIT, modes=modes),
         sensors=[jb.Sensor(0.5)],
         loads=loads,
         contact=LIFTING,
         run=jb.Run(duration, sample_rate=64 / duration, gravity=G),
     )
-    record = jb.simulate(case)
+
+
+@pytest.mark.parametrize("modes", [3, 10])
+def test_no_impact_gains_energy_and_held_wheels_hardly_pull(modes, monkeypatch):
+    """The drive does the work of an impulse on the slope; the others lose."""
+    kept, own = [], lifting.run_unilateral
+
+    def keep(case, model, *rest):
+        kept.append((model, own(case, model, *rest)))
+        return kept[-1][1]
+
+    monkeypatch.setattr(lifting, "run_unilateral", keep)
+    jb.simulate(three_masses(modes))
+    model, run = kept[-1]
+    lost, impulses = [], []
+    k = np.pi * np.arange(1, modes + 1)
+    for before, after in itertools.pairwise([*run.pieces, run.last]):
+        x = 1.27 * after.start - np.array([0.0, 0.21, 0.42])
+        slopes = np.sqrt(2.0) * k * np.cos(k * x[:, None]) * before.on_beam[:, None]
+        ends = (before.states[-1], before.heights[-1]), (after.states[0], after.heights[0])
+        rates = [np.append(q[model.rate_index], e[run.law.rate_index]) for q, e in ends]
+        masses = np.append(np.ones(modes), run.law.mass)
+        impulse = (masses * (rates[1] - rates[0]))[modes:]
+        if np.max(np.abs(impulse)) < 1e-10:
+            continue
+        by_drive = impulse @ (1.27 * slopes @ before.states[-1][model.coordinate_index])
+        lost.append(by_drive - masses @ (rates[1] ** 2 - rates[0] ** 2) / 2)
+        impulses.append(impulse)
+    assert len(lost) > 15 and min(lost) > 0
+    assert -1e-4 * np.max(impulses) < np.min(impulses) < 0  # some were held
+
+
+def test_too_many_impacts_end_the_run(monkeypatch):
+    monkeypatch.setattr(lifting, "MAX_EVENTS", 6)
+    monkeypatch.setattr(lifting, "EVENT_SHARE", 1.0)
+    with pytest.raises(RuntimeError, match=r"wheel \d leaves and lands more than 6 times within"):
+        jb.simulate(three_masses())
+
+
+def test_impacts_that_follow_each_other_ever_faster_come_to_an_end():
+    """Three masses throw each other up; Moreau's time steps approach the run as they shorten."""
+    speed, masses = 1.27, np.array([0.13, 0.22, 0.51])
+    starts, duration = np.array([0.0, -0.21, -0.42]), 1.3 / 1.27
+    record = jb.simulate(three_masses())
     assert 10 < record.flights.wheel.size < 40
     frequencies = np.pi**2 * np.arange(1, 4) ** 2
     x = np.array([0.1, 0.37, 0.5, 0.81])
