@@ -40,7 +40,7 @@ OPTIONS = {  # of each source, with the units of those that are numbers
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)  # a table
 class Combined(TableViews):
     """Lowest and highest effects (combination, position) of named combinations at positions (m)."""
 

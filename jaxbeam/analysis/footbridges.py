@@ -35,7 +35,7 @@ DENSE = 1.0  # people/m^2: density from which on paces are no longer free
 POINTS = 2001  # along the beam, of the integral of a shape
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)  # a table
 class StreamResponse(TableViews):
     """Largest accelerations (m/s^2) of modes in resonance with a stream, and frequencies (Hz).
 

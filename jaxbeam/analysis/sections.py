@@ -44,7 +44,7 @@ from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
-from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.record import Record, envelope_headline, with_unit
 from jaxbeam.simulation.simulate import integration_setup, run_integration
 
 
@@ -165,11 +165,15 @@ class Envelope(TableViews, Module):
     quantity: str = eqx.field(static=True, default="deflection")
 
     @property
+    def headline(self) -> str:
+        """The lowest and highest value of all, and where they are."""
+        return envelope_headline(self.quantity, self.positions, self.lowest, self.highest)
+
+    @property
     @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Position (m), lowest and highest value, by head."""
-        unit = QUANTITIES[self.quantity].unit
-        head = self.quantity if unit == "1" else f"{self.quantity} ({unit})"
+        head = with_unit(self.quantity)
         return {
             "position (m)": np.asarray(self.positions),
             f"lowest {head}": np.asarray(self.lowest),

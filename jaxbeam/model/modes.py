@@ -24,7 +24,7 @@ from numpy.polynomial import legendre
 from jaxbeam.case.arguments import check_classes
 from jaxbeam.case.beam import MATERIALS, Beam
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import NO_TORSION, SLOPE, TWIST, TWIST_RATE
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.elements import (
@@ -143,7 +143,6 @@ def ratios_of_segments(
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
-MAX_LISTED = 12  # modes in the text of all
 ROUNDING_LEVEL = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
@@ -185,15 +184,6 @@ class Modes(TableViews, Module):
     twist_series: Float[Array, "segment degree mode"] | None = None
     rail_nodes: Float[Array, " rail_node"] | None = None
     rail_series: Float[Array, "piece term mode"] | None = None
-
-    def __repr__(self) -> str:
-        if not is_concrete(self.stiffness) or self.stiffness.ndim != 1:
-            return f"Modes({self.stiffness.shape[-1]} modes)"
-        numbers = zip(concrete(self.frequencies), concrete(self.damping_ratios), strict=True)
-        rows = [f"  {i}: {f:.5g} Hz, damping ratio {z:.3g}" for i, (f, z) in enumerate(numbers, 1)]
-        if len(rows) > MAX_LISTED:
-            rows[MAX_LISTED - 1 : -1] = ["  ..."]
-        return "\n".join([self.headline, *rows])
 
     @property
     def headline(self) -> str:

@@ -73,6 +73,15 @@ class StateSpace(Module):
     outputs: tuple[Signal, ...] = eqx.field(static=True)
     period: Float[Array, ""] | None = None
 
+    def __repr__(self) -> str:
+        named = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        lines = [
+            f"  {name}: " + ", ".join(f"{one.name} ({one.unit})" for one in signals)
+            for name, signals in named.items()
+        ]
+        kind = "z' = A z + B u" if self.period is None else "z_(k+1) = A z_k + B u_k"
+        return "\n".join([f"StateSpace: {kind}, y = C z + D u", *lines])
+
     def discretize(self, period: Float[Array, ""] | float) -> "StateSpace":
         """Discrete-time system with this sampling period (s), exact for inputs held in between.
 
@@ -190,6 +199,14 @@ class Plant(Module):
     loads: LoadSet
     coordinate_scale: Float[Array, " mode"]
     coordinate: Signal = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        count = self.coordinate_scale.shape[-1]
+        title = f" of {self.case.title!r}" if self.case.title else ""
+        return (
+            f"Plant{title}: {count} modes in {self.coordinate.name} ({self.coordinate.unit});"
+            " .at(t) returns the StateSpace at a time t (s)"
+        )
 
     @property
     def states(self) -> tuple[Signal, ...]:

@@ -22,7 +22,7 @@ NO_BREAK = "\N{NO-BREAK SPACE}"
 GAP = 2  # spaces between columns
 LEAST_WIDTH = 20  # of a terminal; in a narrower one lines are broken
 UNIT = re.compile(r"\([^()]{1,9}\)")  # as "(N m)", which is not broken
-MAX_SHOWN = 20  # rows of a result in a notebook
+MAX_SHOWN = 20  # rows of a result
 
 
 def terminal_width() -> int | None:
@@ -175,8 +175,23 @@ class TableViews:
         first, *_ = columns = self.columns
         return pandas.DataFrame(dict(columns)).set_index(first)
 
+    def __repr__(self) -> str:
+        """The table under its headline; of traced or several results the arrays."""
+        if (table := self._shown_table()) is None:
+            return super().__repr__()
+        numeric = (column.dtype.kind in "fiu" for column in self.columns.values())
+        alignment = "".join("<>"[is_number] for is_number in numeric)
+        return "\n".join([self.headline, *text_table(*table, alignment, indent="  ")])
+
     def _repr_html_(self) -> str | None:
         """Table of the columns in a notebook; None leaves traced or several results to the text."""
+        if (table := self._shown_table()) is None:
+            return None
+        remarks = "".join(f"<p>{escape(one)}</p>" for one in getattr(self, "remarks", ()))
+        return html_table(*table, self.headline) + remarks
+
+    def _shown_table(self) -> tuple[list[str], list[list[str]]] | None:
+        """Heads and the first rows of the table; None of traced or several results."""
         from jaxbeam.runtime.arrays import any_traced
 
         if any_traced(self):
@@ -189,8 +204,7 @@ class TableViews:
         if len(rows) > MAX_SHOWN:
             more = f"... {len(rows) - MAX_SHOWN} more ..."
             rows[MAX_SHOWN - 1 : -1] = [[more, *[""] * (len(columns) - 1)]]
-        remarks = "".join(f"<p>{escape(one)}</p>" for one in getattr(self, "remarks", ()))
-        return html_table(list(columns), rows, self.headline) + remarks
+        return list(columns), rows
 
 
 def _cell(entry: Any) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import concrete, is_concrete, real_numbers, refuse_traced, refuses_traced
 from jaxbeam.case.sensors import QUANTITIES, Sensor
 from jaxbeam.model.along_beam import moving_positions, refined, sections
@@ -56,10 +57,15 @@ class RecordEnvelope(TableViews, Module):
     coincident: str = eqx.field(static=True, default="")
 
     @property
+    def headline(self) -> str:
+        """The smallest and largest value of all, and where they are."""
+        return envelope_headline(self.quantity, self.positions, self.smallest, self.largest)
+
+    @property
     @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Position (m), smallest and largest value with their times (s), by head."""
-        head = _head(self.quantity)
+        head = with_unit(self.quantity)
         columns = {
             "position (m)": np.asarray(self.positions),
             f"smallest {head}": np.asarray(self.smallest),
@@ -68,7 +74,7 @@ class RecordEnvelope(TableViews, Module):
             "time of largest (s)": np.asarray(self.largest_time),
         }
         if self.coincident:
-            other = _head(self.coincident)
+            other = with_unit(self.coincident)
             columns[f"{other} at smallest"] = np.asarray(self.smallest_coincident)
             columns[f"{other} at largest"] = np.asarray(self.largest_coincident)
         return columns
@@ -97,9 +103,21 @@ class RecordEnvelope(TableViews, Module):
         return labelled_dataset(variables, {"position": x}, {"quantity": self.quantity})
 
 
-def _head(quantity: str) -> str:
+def with_unit(quantity: str) -> str:
+    """A quantity with its unit, as the head of a column: "moment (N m)"."""
     unit = QUANTITIES[quantity].unit
     return quantity if unit == "1" else f"{quantity} ({unit})"
+
+
+def envelope_headline(quantity: str, positions, smallest, largest) -> str:
+    """Sentence on the extremes of an envelope along the beam, and their positions (m)."""
+    unit = QUANTITIES[quantity].unit
+    low, high = np.argmin(smallest), np.argmax(largest)
+    return (
+        f"Envelope of {quantity}: smallest {with_prefix(smallest[low], unit)} at"
+        f" {positions[low]:.6g} m, largest {with_prefix(largest[high], unit)} at"
+        f" {positions[high]:.6g} m"
+    )
 
 
 def record_envelope(

@@ -77,6 +77,10 @@ class Simulator(Module):
         plan = varied_plan(case, ranges, times, self.tolerance, plan_of_peaks)
         self.prepared = _Prepared(case, ranges, plan, times)
 
+    def __repr__(self) -> str:
+        varied = ", ".join(self.prepared.ranges) or "no number"
+        return f"Simulator of {self.prepared.case.title!r}: varies {varied}"
+
     def __call__(self, values: Mapping[str, Any] | Any = ()) -> Record:
         """Record for some values in SI units, by address or in the order of the addresses."""
         case, ranges = self.prepared.case, self.prepared.ranges

@@ -262,5 +262,30 @@ def test_text_has_the_extremes_of_each_sensor(record):
 
 
 def test_text_of_modes(record):
-    first = f"  1: {record.modes.frequencies[0]:.5g} Hz, damping ratio 0.02"
-    assert repr(record.modes).splitlines()[:2] == ["Modes: 3 of the beam", first]
+    head, titles, first, *_ = repr(record.modes).splitlines()
+    assert head == "Modes: 3 of the beam"
+    assert titles.split("  ")[1:] == ["mode", "frequency (Hz)", "damping ratio"]
+    assert first.split() == ["1", f"{record.modes.frequencies[0]:.6g}", "0.02"]
+
+
+def test_text_of_an_envelope_names_its_extremes(record):
+    """The largest deflection of a positive load is near midspan; the table ends at the beam's."""
+    found = record.envelope("deflection", np.linspace(0, record.case.beam.length, 41))
+    lines = str(found).splitlines()
+    largest = found.largest.argmax()
+    words = f"largest {1e3 * found.largest[largest]:.4g} mm at {found.positions[largest]:.6g} m"
+    assert lines[0].startswith("Envelope of deflection: smallest ") and words in lines[0]
+    assert "... 21 more ..." in lines[-2]
+    assert lines[-1].split()[0] == f"{float(record.case.beam.length):.6g}" and len(lines) == 23
+
+
+def test_texts_of_plants_and_simulators(record):
+    plant = jb.state_space(record.case)
+    assert str(plant).startswith("Plant of 'a run for its record': 3 modes in q (m kg^0.5)")
+    lines = str(plant.at(0.1)).splitlines()
+    assert lines[0] == "StateSpace: z' = A z + B u, y = C z + D u"
+    assert [line.split(":")[0].strip() for line in lines[1:]] == ["states", "inputs", "outputs"]
+    assert lines[1].count(",") == 5 and "sensor_0_deflection (m)" in lines[3]
+    assert "z_(k+1) = A z_k + B u_k" in str(plant.at(0.1).discretize(1e-3))
+    simulator = jb.Simulator(record.case, vary=["loads.0.speed"])
+    assert str(simulator) == "Simulator of 'a run for its record': varies loads.0.speed"

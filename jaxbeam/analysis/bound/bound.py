@@ -472,6 +472,9 @@ class Bound(Module):
     active_constraints: ActiveConstraints
     driven: tuple[int, ...]
 
+    def __repr__(self) -> str:
+        return f"Bound: {self.verdict}"
+
     @property
     def reduction(self) -> float:
         """Attainable reduction as a fraction of the uncontrolled peak, 0 to 1."""
