@@ -7,13 +7,13 @@ from .analysis.linearised_loop import to_control as to_control
 from .analysis.sections import envelope as envelope
 from .case import actuators as actuators, profiles as profiles
 from .case.absorbers import Absorber as Absorber
-from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
-from .case.actuators.patch import Patch as Patch
-from .case.actuators.point import (
+from .case.actuators.base import (
+    Patch as Patch,
     PointForce as PointForce,
     Shaker as Shaker,
     SpringDamper as SpringDamper,
 )
+from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.beam import Beam as Beam, Hinge as Hinge, Segment as Segment, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.contact import (
@@ -22,7 +22,7 @@ from .case.contact import (
 )
 from .case.loads import vehicles as vehicles
 from .case.loads.axles import Axles as Axles, LineLoad as LineLoad
-from .case.loads.point import (
+from .case.loads.base import (
     MovingForce as MovingForce,
     MovingMass as MovingMass,
     VaryingForce as VaryingForce,

@@ -7,7 +7,7 @@ would be found first.
 import sys
 from typing import TYPE_CHECKING
 
-from jaxbeam.runtime.own_packages import own_package
+from jaxbeam.runtime.packages import own_package
 
 if TYPE_CHECKING:
     from tuning import *  # noqa: F403

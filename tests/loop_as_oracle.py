@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
-from jaxbeam.case.actuators.point import Shaker
+from jaxbeam.case.actuators.base import Shaker
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.loads.base import MovingMass
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.state_controller import StateFeedback
 from tests.oracles import closed_loop, finite_elements

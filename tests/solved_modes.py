@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 
-from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.base import Patch
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes, mesh_layout, modes

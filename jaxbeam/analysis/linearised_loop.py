@@ -41,7 +41,7 @@ from jaxbeam.case.controller import (
     Measurement,
 )
 from jaxbeam.case.fields import concrete, refuses_traced
-from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.loads.base import MovingMass
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import SampledStateLaw

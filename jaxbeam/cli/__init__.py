@@ -1,6 +1,6 @@
 """Command line: commands read arguments, call the library and print what it returns."""
 
-from jaxbeam.runtime.own_packages import find_siblings
+from jaxbeam.runtime.packages import find_siblings
 
 find_siblings()  # the working folder may have other modules named `tuning` or `experiments`
 

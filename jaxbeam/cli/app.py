@@ -23,22 +23,18 @@ from cyclopts import (
 )
 
 from jaxbeam.cli.arguments import UsageError
-from jaxbeam.cli.commands.app import app as app_command
-from jaxbeam.cli.commands.benchmark import benchmark
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering import assess, check, combine, envelope, influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes, state_space
-from jaxbeam.cli.commands.identify import identify
-from jaxbeam.cli.commands.models import compare_models, design_experiment
-from jaxbeam.cli.commands.modes_from_log import modes_from_log
-from jaxbeam.cli.commands.monitor import monitor
-from jaxbeam.cli.commands.new import new, schema
+from jaxbeam.cli.commands.identify import compare_models, design_experiment, identify
+from jaxbeam.cli.commands.modes_from_log import modes_from_log, monitor
+from jaxbeam.cli.commands.published import benchmark, demo, reproduce
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
+from jaxbeam.cli.commands.start import app as app_command, new, schema
 from jaxbeam.cli.commands.sweep import native, sweep
-from jaxbeam.cli.commands.thesis import demo, reproduce
 from jaxbeam.cli.commands.tune import tune
 from jaxbeam.cli.commands.weigh import calibrate, identify_responses, traffic, weigh
 from jaxbeam.cli.options import print_message

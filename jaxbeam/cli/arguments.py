@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxbeam.case.toml_file import is_quantity, number_and_unit
-from jaxbeam.files.endings import check_ending
+from jaxbeam.runtime.output_file import check_ending
 
 if TYPE_CHECKING:
     from jaxbeam.case.case import Case

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import ControlStep, EstimatedLoads
-from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.loads.base import MovingMass
 from jaxbeam.case.trajectory import NEVER, has_come
 from jaxbeam.control.load_identification import AbstractLoadSource
 from jaxbeam.control.state_controller import AbstractStateLaw

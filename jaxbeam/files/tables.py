@@ -22,9 +22,8 @@ from jaxbeam.case.case import Case, address_words, unit_at
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
 from jaxbeam.model.state_space import StateSpace
-from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.output_file import DATASETS, RESULTS, TABLES, check_ending, whole_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

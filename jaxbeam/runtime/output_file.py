@@ -1,4 +1,4 @@
-"""Files that are written: whole or not there, and locked while one process writes them.
+"""Files that are written: their endings; whole or not there; locked while one process writes them.
 
 A lock outlives the crash of its process and is then taken over: on the same machine when no process
 of that number and start time is left, from other machines when its last sign of life (the time of
@@ -9,6 +9,7 @@ clocks of the machines may differ.
 import contextlib
 import contextvars
 import datetime
+import importlib.util
 import json
 import os
 import platform
@@ -105,6 +106,33 @@ def refuse_folder(place: Path, path: str | os.PathLike, by_file: bool = False) -
     is_store = any((place / name).is_file() for name in ("zarr.json", ".zgroup"))
     if by_file or not (is_store or next(place.iterdir(), None) is None):
         raise FileExistsError(f"{os.fspath(path)} is a folder, not a file; choose another name")
+
+
+TABLES = (".csv", ".xlsx", ".mat", ".parquet")  # columns of numbers with heads
+DATASETS = (".nc", ".zarr")  # everything, with units and coordinates
+RESULTS = (*DATASETS, *TABLES)
+PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
+
+
+def check_ending(path: str | os.PathLike, content: str, allowed: tuple[str, ...] = RESULTS) -> None:
+    """Check that a result can be written to a file by its ending.
+
+    Raises ValueError for no name, or another ending than those allowed; ImportError, with what to
+    install, if the package that writes it is missing.
+    """
+    check_named(path)
+    ending = Path(path).suffix
+    if ending not in allowed:
+        first = Path(path).with_suffix(allowed[0])
+        more = [one for one in dict.fromkeys(allowed) if one != allowed[0]]
+        others = f", or {', '.join(more)}" if more else ""
+        raise ValueError(f"{content} is written to a {allowed[0]} file; call it {first}{others}")
+    package = PACKAGES.get(ending, "")
+    if package and importlib.util.find_spec(package) is None:
+        raise ImportError(
+            f"{ending} files need {package}, which is not installed: pip install {package}, or"
+            " 'jaxbeam[tables]'"
+        )
 
 
 SIGN_OF_LIFE = 10.0  # s, between two signs of life

@@ -17,14 +17,13 @@ from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
-from jaxbeam.files.endings import check_ending
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.report import interactive_page
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array, Module, any_traced
-from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.output_file import check_ending, whole_file
 from jaxbeam.runtime.printer import TableViews, html_table, labelled_dataset, text_table
 from jaxbeam.simulation.errors import Extremes
 

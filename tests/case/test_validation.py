@@ -16,9 +16,8 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 import jaxbeam as jb
+from jaxbeam.case.actuators.base import Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import (
     Case,
@@ -29,7 +28,7 @@ from jaxbeam.case.case import (
     unit_at,
     value_at,
 )
-from jaxbeam.case.loads.point import MovingForce, MovingMass
+from jaxbeam.case.loads.base import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.toml_file import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
 from jaxbeam.case.trajectory import NEVER, BrakingTrajectory, TabulatedTrajectory

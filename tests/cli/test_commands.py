@@ -12,7 +12,7 @@ from jaxbeam.benchmark.problem import TEST_SEEDS
 from jaxbeam.cli import main
 from jaxbeam.cli.app import RENAMED_COMMANDS, RENAMED_OPTIONS, app, refuse_former_words
 from jaxbeam.cli.arguments import bounds_in_si, pair_in_si, parse_bounds, parse_prior
-from jaxbeam.cli.commands.new import KINDS
+from jaxbeam.cli.commands.start import KINDS
 
 CART = """
 [[bodies]]

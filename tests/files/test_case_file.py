@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce, Shaker
+from jaxbeam.case.actuators.base import Patch, PointForce, Shaker
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.loads.point import MovingForce, MovingMass
+from jaxbeam.case.loads.base import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.files.case_file import (
     case_from_dict,

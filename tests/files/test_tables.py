@@ -21,7 +21,6 @@ from openpyxl.utils.escape import unescape
 import jaxbeam as jb
 import tuning
 from jaxbeam.cli import main
-from jaxbeam.files.endings import RESULTS, TABLES, check_ending
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.report import (
     ReportFigure,
@@ -39,6 +38,7 @@ from jaxbeam.files.tables import (
     write_state_space,
     write_table,
 )
+from jaxbeam.runtime.output_file import RESULTS, TABLES, check_ending
 
 CASE = jb.Case(
     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),

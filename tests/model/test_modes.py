@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.actuators.patch import Patch
+from jaxbeam.case.actuators.base import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.model.modes import Modes, mesh_layout, modes

@@ -12,13 +12,11 @@ from scipy.integrate import quad
 
 import jaxbeam as jb
 from jaxbeam.analysis.sections import influence_table
-from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import Shaker, SpringDamper
+from jaxbeam.case.actuators.base import Patch, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.fields import kinds
-from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.point import MovingForce, MovingMass
+from jaxbeam.case.loads.base import AbstractLoad, MovingForce, MovingMass
 from jaxbeam.model.deflection_lines import influence_line, static_deflection
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import static_peak

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.actuators.point import PointForce
+from jaxbeam.case.actuators.base import PointForce
 from jaxbeam.case.case import replace
 from jaxbeam.case.loads.vehicles import Oscillator
 from jaxbeam.runtime.arrays import xp

@@ -4,17 +4,16 @@ import itertools
 
 from hypothesis import strategies as st
 
+from jaxbeam.case.actuators.base import Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.case.actuators.electrodynamic import (
     AbstractInnerLoop,
     CurrentLoop,
     Electrodynamic,
     ForceLoop,
 )
-from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.loads.point import MovingForce, MovingMass
+from jaxbeam.case.loads.base import MovingForce, MovingMass
 from jaxbeam.case.sensors import QUANTITIES, Filter, Sensor
 
 

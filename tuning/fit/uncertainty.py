@@ -16,10 +16,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from jaxbeam.case.fields import refuses_traced
-from jaxbeam.files.endings import import_extra
 from jaxbeam.files.report import ReportTable
 from jaxbeam.plot.style import COLOURS, FAINT, INK, use_style
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.packages import import_extra
 from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.least_squares import t_quantile

@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.fields import refuses_traced
-from jaxbeam.files.endings import check_ending
-from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.output_file import check_ending, whole_file
 from tuning.logs.log import Log
 from tuning.logs.quality import sensor_readings
 from tuning.logs.units import time_derivative

@@ -25,8 +25,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
-from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.loads.base import AbstractLoad, MovingMass
 from tuning.fit.dataset import WHITENESS_SIGNIFICANCE
 from tuning.fit.identify import identify
 from tuning.fit.least_squares import t_quantile

@@ -1,9 +1,8 @@
-"""Actuators, one kind a file, with the interface of `base`."""
+"""Actuators, with the interface of `base`."""
 
+from jaxbeam.case.actuators.base import Patch, PointForce, Shaker, SpringDamper
 from jaxbeam.case.actuators.electrodynamic import CurrentLoop, Electrodynamic, ForceLoop
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
-from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 
 __all__ = [
     "Creep",

@@ -17,7 +17,7 @@ from jaxbeam.cli.options import (
     print_warnings,
     table,
 )
-from jaxbeam.files.endings import TABLES
+from jaxbeam.runtime.output_file import TABLES
 
 ZERO = 1e-5  # fraction of the largest value of a quantity that is printed as 0
 

@@ -14,7 +14,7 @@ from jaxbeam.cli.arguments import (
     stationary_mass,
 )
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, table
-from jaxbeam.files.endings import RESULTS, TABLES
+from jaxbeam.runtime.output_file import RESULTS, TABLES
 
 MATRIX_SUFFIXES = (".mat", ".npz", ".json", ".csv")
 

@@ -15,7 +15,7 @@ from jaxbeam.cli.options import (
     print_plausibility,
     table,
 )
-from jaxbeam.files.endings import RESULTS
+from jaxbeam.runtime.output_file import RESULTS
 
 EXTREMES = "smallest", "smallest_time", "largest", "largest_time"
 MAX_WHEELS = 8  # of a load, or bodies, with a row each

@@ -23,7 +23,7 @@ from jaxbeam.cli.options import (
     print_plausibility,
     table,
 )
-from jaxbeam.files.endings import RESULTS
+from jaxbeam.runtime.output_file import RESULTS
 
 if TYPE_CHECKING:
     import numpy as np

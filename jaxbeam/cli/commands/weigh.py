@@ -18,7 +18,7 @@ from jaxbeam.cli.arguments import (
     refuse_option,
 )
 from jaxbeam.cli.options import CaseOptions, Free, LogOptions, Output
-from jaxbeam.files.endings import TABLES, check_ending
+from jaxbeam.runtime.output_file import TABLES, check_ending
 
 
 def weigh(

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxbeam as jb
-from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.loads.base import MovingMass
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.validation import check_case
 from tests.oracles.planted_structures import Structure, random_structure, response

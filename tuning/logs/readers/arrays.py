@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import netcdf_file
 
-from jaxbeam.files.endings import import_extra
+from jaxbeam.runtime.packages import import_extra
 from tuning.logs.readers.headings import epoch_seconds, is_stamp, unnamed
 from tuning.logs.readers.table import (
     STARTS,

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbeam.files.endings import import_extra
+from jaxbeam.runtime.packages import import_extra
 from tuning.logs.readers.headings import (
     MAX_HEADING_ROWS,
     Headings,

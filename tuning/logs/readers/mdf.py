@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbeam.files.endings import import_extra
+from jaxbeam.runtime.packages import import_extra
 from tuning.logs.readers.table import (
     Clock,
     LogFormat,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import scipy.io.wavfile
 
-from jaxbeam.files.endings import import_extra
+from jaxbeam.runtime.packages import import_extra
 from tuning.logs.readers.table import (
     Clock,
     LogFormat,

@@ -1,7 +1,7 @@
-"""Import of `tuning` and `experiments`, the packages next to jaxbeam, from its own folder.
+"""Imports of packages by name: own ones next to jaxbeam, and optional ones of its extras.
 
-Their names are common words: a file `tuning.py` in the working folder would be found first in a
-notebook, with `python -m` or with PYTHONPATH.
+The names of `tuning` and `experiments`, next to jaxbeam, are common words: a file `tuning.py` in
+the working folder would be found first in a notebook, with `python -m` or with PYTHONPATH.
 """
 
 import importlib
@@ -57,3 +57,14 @@ def own_package(name: str) -> ModuleType:
             f" import jaxbeam.{name} before it"
         )
     return module
+
+
+def import_extra(name: str, extra: str) -> ModuleType:
+    """Import a library of an extra of jaxbeam. Raises ImportError, which says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(
+            f"{name} is not installed; install jaxbeam with the extra {extra!r}: "
+            f"pip install 'jaxbeam[{extra}]'"
+        ) from None
