@@ -192,8 +192,9 @@ class ScheduledInternalModel(AbstractController):
     Commands follow from a table. `shares` are deflections due to the load, downwards positive, over
     the lift of the full command of the actuator; `values` are the commands for them over the full
     one, negative ones over the opposite limit. They are interpolated linearly and held beyond the
-    ends, where the loop is open. If left out they are those of `experiments.studies.one_law.tune`,
-    found on two rigs, with several delays, rigidities and loads at once.
+    ends, where the loop is open. If left out they are those that
+    `experiments.studies.one_law_search` found on two rigs, with several delays, rigidities and
+    loads at once.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

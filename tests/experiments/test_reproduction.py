@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.thesis import page, reproduction, results_tables
+from experiments.thesis import page, reproduction
 from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit_rig
 from experiments.thesis.chapter5 import published as chapter5
 from experiments.thesis.chapter6 import published as chapter6
@@ -288,7 +288,7 @@ def rig(*shares: tuple[str, float, float]) -> list[str]:
     return [f"{k}: at least {a}% of the achievable, {b}% in the mean" for k, a, b in shares]
 
 
-TABLES = (results_tables.TUNED_ROWS, results_tables.SENSED_ROWS)
+TABLES = (page.TUNED_ROWS, page.SENSED_ROWS)
 LABELS = [labels for rows in TABLES for labels in rows.values()]
 SHARES = [
     ["B: one span", *rig(*((labels[0], 90.0, 95.0) for labels in LABELS))],
@@ -311,13 +311,13 @@ MARKED = "".join(f"<!-- {n} -->old<!-- end of {n} -->\n" for n in ("tuned", "sen
 
 
 def test_tables_are_written_between_their_marks():
-    written = results_tables.with_tables(MARKED, REPORT)
-    assert "old" not in written and results_tables.with_tables(written, REPORT) == written
+    written = page.with_tables(MARKED, REPORT)
+    assert "old" not in written and page.with_tables(written, REPORT) == written
     assert "| tuned table | 90.0 % (95.0 %) | worse than no control |" in written
     assert "| as tuned | 98.4 % | 97.1 % |  |  |  |" in written
     assert "| filter |  |  |  |  | worse than no control |" in written and "lift" not in written
     with pytest.raises(ValueError, match="no marks <!-- sensed -->"):
-        results_tables.with_tables(MARKED.replace("sensed", "x"), REPORT)
+        page.with_tables(MARKED.replace("sensed", "x"), REPORT)
 
 
 # Counts of verdicts on the pages: computed from a report, and the same on all pages.

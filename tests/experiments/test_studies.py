@@ -10,12 +10,13 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from experiments.studies import (
     fragility,
+    one_law,
+    one_law_detuned,
+    one_law_search,
     sensor_feedback,
     tuned_feedforward,
 )
 from experiments.studies.held_out import RIGIDITY, held_out_loads, training_loads
-from experiments.studies.one_law import detuned, plants, tune
-from experiments.studies.one_law.per_plant import TABLE_FILE
 from experiments.studies.patch_drift import (
     CREEP,
     HYSTERESIS,
@@ -163,11 +164,11 @@ def test_a_softer_plant_keeps_the_design_of_the_law():
 
 
 def test_a_plant_and_its_wrong_numbers():
-    case = plants.plant_case("C", plants.ONE_LAW, 5.0, 0.04, 0.8)
+    case = one_law.plant_case("C", one_law.ONE_LAW, 5.0, 0.04, 0.8)
     assert isinstance(case.controller, jb.ScheduledInternalModel)
     assert [s.filter.cutoff for s in case.sensors if s.filter is not None] == [5.0, 5.0]
     assert float(case.beam.flexural_rigidity) == pytest.approx(0.8 * 12.277)
-    told = plants.misinformed(case, -1)
+    told = one_law.misinformed(case, -1)
     assert told.controller is not None and told.controller.delay is not None
     assert float(told.controller.delay) == pytest.approx(0.045)
     nominal, plant = told.controller.law(None), case.controller.law(jb.state_space(case))
@@ -176,9 +177,9 @@ def test_a_plant_and_its_wrong_numbers():
 
 
 def test_cells_and_the_table_of_the_page():
-    assert plants.cell(np.array([0.9, 1.0])) == "90.0 % (95.0 %)"
-    assert plants.cell(np.array([-0.1, 1.0])) == plants.NO_GAIN
-    table = plants.TABLE_FILE.read_text("utf-8").splitlines()
+    assert one_law.cell(np.array([0.9, 1.0])) == "90.0 % (95.0 %)"
+    assert one_law.cell(np.array([-0.1, 1.0])) == one_law.NO_GAIN
+    table = one_law.TABLE_FILE.read_text("utf-8").splitlines()
     page = (ROOT / "docs" / "explanation" / "results.md").read_text("utf-8")
     assert "_static/one_law.md" in page
     # What the guide says of the law: no less than 85 %, on both rigs.
@@ -189,14 +190,14 @@ def test_cells_and_the_table_of_the_page():
 
 def test_what_the_page_says_of_a_rigidity_that_nobody_told():
     """15 % softer: above 88 % on both rigs; neither of the two ways is better on all of them."""
-    lines = detuned.TABLE_FILE.read_text("utf-8").splitlines()[2:]
+    lines = one_law_detuned.TABLE_FILE.read_text("utf-8").splitlines()[2:]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     worst = {
-        row[0]: [-1.0 if one == plants.NO_GAIN else float(one.split()[0]) for one in row[1:]]
+        row[0]: [-1.0 if one == one_law.NO_GAIN else float(one.split()[0]) for one in row[1:]]
         for row in rows
     }
-    assert len(worst) == len(detuned.FACTORS) * len(detuned.SPANS)
-    assert min(worst[f"{span}, -15 %"][0] for span in detuned.SPANS.values()) > 88
+    assert len(worst) == len(one_law_detuned.FACTORS) * len(one_law_detuned.SPANS)
+    assert min(worst[f"{span}, -15 %"][0] for span in one_law_detuned.SPANS.values()) > 88
     assert worst["two spans, -15 %"][0] > worst["two spans, +0 %"][0]
     for way in (1, 2):
         gains = [row[way] - row[0] for row in worst.values()]
@@ -204,17 +205,17 @@ def test_what_the_page_says_of_a_rigidity_that_nobody_told():
 
 
 def test_search_starts_from_the_table_of_the_law_and_finds_a_peak():
-    start = tune.numbers_of(VALUES, REFERENCE)
-    made = tune.law(start)
+    start = one_law_search.numbers_of(VALUES, REFERENCE)
+    made = one_law_search.law(start)
     assert_allclose(made.values, VALUES)
     assert_allclose(made.reference, REFERENCE)
     target = np.linspace(0.3, 0.8, len(start))
-    found = tune.search(start, 60, lambda x: -float(np.sum((x - target) ** 2)))
+    found = one_law_search.search(start, 60, lambda x: -float(np.sum((x - target) ** 2)))
     assert np.max(np.abs(found - target)) < 0.1 * np.max(np.abs(start - target))
 
 
 def test_what_the_page_says_is_lost_against_laws_of_their_own():
-    lines = TABLE_FILE.read_text("utf-8").splitlines()[2:]
+    lines = one_law_search.TABLE_FILE.read_text("utf-8").splitlines()[2:]
     worst = [[float(cell.split()[0]) for cell in line.split("|")[4:6]] for line in lines]
     assert len(worst) == 8 and 4.5 < max(own - one for one, own in worst) < 5.5
     page = (ROOT / "docs" / "explanation" / "results.md").read_text("utf-8")

@@ -1,14 +1,14 @@
 """The one law on beams whose rigidity it does not know, and two ways to make up for that.
 
-    python -m experiments.studies.one_law.detuned   # prints; with --pages writes docs/_static too
+    python -m experiments.studies.one_law_detuned   # prints; with --pages writes docs/_static too
 
 The law is designed for the rigidity as printed, with delays of 0, 20 and 40 ms behind the filter of
 10 Hz; the beam is softer or stiffer by a factor. Beside it, on the same held-out loads:
 
 - the law designed for the true rigidity, as after an identification without error;
 - the law with numbers optimised for the worst of beams whose rigidity it does not know (0.85, 1 and
-  1.15 of the printed one; delays of 0 and 40 ms; training loads), by the strategy of `tune` over
-  the same equations with fixed steps of 1 ms, in 60 generations, and rounded.
+  1.15 of the printed one; delays of 0 and 40 ms; training loads), by the strategy of
+  `one_law_search` over the same equations with fixed steps of 1 ms, in 60 generations, and rounded.
 
 The last columns are of loads that are lighter, heavier and faster than any of the search.
 """
@@ -23,7 +23,7 @@ from jaxtyping import Float
 import jaxbeam as jb
 import tuning
 from experiments.studies.held_out import HELD_OUT_ENTRY_TIME, held_out_loads, with_rigidity
-from experiments.studies.one_law.plants import (
+from experiments.studies.one_law import (
     DELAYS,
     ONE_LAW,
     RIGIDITY,
@@ -32,15 +32,15 @@ from experiments.studies.one_law.plants import (
     cell,
     plant_case,
 )
-from experiments.studies.one_law.tune import CUTOFF, with_numbers
+from experiments.studies.one_law_search import CUTOFF, with_numbers
 from jaxbeam.runtime.printer import markdown_table
 from tuning.control.run_set import AddressValues
 
-TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law_detuned.md"
+TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "one_law_detuned.md"
 FACTORS = 0.8, 0.85, 1.0, 1.15  # of the rigidity as printed
 OUTER_MASSES = 0.2, 0.6  # kg
 OUTER_SPEEDS = {"B": (0.4, 1.05), "C": (0.6, 1.05)}  # m/s
-# Sizes of the values below zero and above, and the reference: see `tune`.
+# Sizes of the values below zero and above, and the reference: see `one_law_search`.
 WORST_CASE = np.array([1.0, 0.64, 0.14, 0.3, 0.39, 0.59, 0.69, 0.82, 0.93, 1.0, 0.49])
 HEADER = "rigidity", "not known", "known to the law", "law for the worst case", "other loads"
 

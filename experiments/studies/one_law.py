@@ -15,6 +15,7 @@ A last row gives the scheduled law wrong numbers of its plant: the filter 5 % of
 
 import dataclasses
 import itertools
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +34,7 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import AddressValues
 
-TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law.md"
+TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "one_law.md"
 CUTOFFS, DELAYS, FACTORS = (5.0, 10.0, 20.0, 40.0), (0.0, 0.02, 0.04), (0.8, 1.0, 1.2)  # Hz, s, -
 RIGIDITY, TOLERANCE = "beam.flexural_rigidity", 1e-4
 ONE_LAW, TUNED, DRAWN = "one law for all", "tuned for its rig", "drawn by hand"
@@ -136,3 +137,7 @@ def main(arguments: list[str]) -> None:
     text = "\n".join(markdown_table(header, rows(Shares()), right_from=1))
     if "--pages" in arguments:
         TABLE_FILE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

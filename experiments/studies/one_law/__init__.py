@@ -1,1 +1,0 @@
-"""One law from the sensors alone for all rigs: its plants, its numbers, and what it loses."""
