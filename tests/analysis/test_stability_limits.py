@@ -36,7 +36,7 @@ from tests.analysis.test_stability import (
     state_matrices,
 )
 from tests.loop_as_oracle import span_of
-from tests.oracles.held_period import over_period
+from tests.oracles.sampled_plant import over_period
 
 STATES = np.diag([1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0])
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import tuning
 from experiments import demo
 from tests.differences import well_compiled
-from tests.tuning import stand_in
+from tests.tuning import small_rig
 
 WRITTEN = {
     "demo.json", "fit.png", "fit.toml", "map.nc", "map.png", "record.nc", "tuned.png", "tuned.toml",
@@ -34,7 +34,7 @@ def test_files_and_tables(tmp_path, capsys, monkeypatch):
 
     def identify(case, logs, free):
         given.update(logs=logs, free=free)
-        return dataclasses.replace(stand_in.fit(), case=case)
+        return dataclasses.replace(small_rig.fit(), case=case)
 
     def tune(case, free, cases, **_):
         given.update(case=case, cases=cases)

@@ -7,7 +7,7 @@ conditioning of the joint vector of all states and readings.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,3 +137,28 @@ def conditioned(
         joint_covariance
         - np.linalg.solve(output_covariance, C @ joint_covariance).T @ C @ joint_covariance
     )[-size:, -size:]
+
+
+INSIDE = 1e-12  # s: matrices are taken so far inside an interval, as they jump at events
+
+
+def over_period(
+    matrices_at: Callable, start: float, end: float, events: Sequence[float] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transition and input matrix from one time (s) to another; no interval contains an event."""
+    cuts = np.unique([start, *[t for t in events if start < t < end], end])
+    states, inputs = matrices_at((start + end) / 2)[1].shape
+    shape = states, states + inputs
+    total = np.eye(*shape)
+    for early, late in zip(cuts[:-1], cuts[1:], strict=True):
+
+        def rate(t, flat, early=early, late=late):
+            A, B = matrices_at(np.clip(t, early + INSIDE, late - INSIDE))
+            rates = A @ flat.reshape(shape)
+            rates[:, states:] += B
+            return rates.ravel()
+
+        settings = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-13 * np.abs(total).max()}
+        total = solve_ivp(rate, (early, late), total.ravel(), **settings).y[:, -1]
+        total = total.reshape(shape)
+    return total[:, :states], total[:, states:]

@@ -22,16 +22,16 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.stored_record import record_from_xarray
 from jaxbeam.simulation.views import contact_sentence, wheel_labels
-from tests.differences import assert_close, plan_of
-from tests.oracles import vehicle_elements
-from tests.oracles.modal_equations import Span
-from tests.simulation.reference_vehicles import (
+from tests.case.loads.reference import (
     DATA,
     RUNS,
     body_index,
     largest,
     simulated,
 )
+from tests.differences import assert_close, plan_of
+from tests.oracles import vehicle_elements
+from tests.oracles.modal_equations import Span
 from tests.simulation.test_record import assert_same
 
 # Others have 16. The two spans have the 40 of the reference, without the correction: it misses

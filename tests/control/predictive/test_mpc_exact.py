@@ -20,7 +20,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from tests.loop_as_oracle import span_of
-from tests.oracles.held_period import over_period
+from tests.oracles.sampled_plant import over_period
 
 PERIOD, LIMITS, RATE = 0.01, (-4.0, 6.0), 250.0
 STARTS, MOMENT, POSITIONS, MASS, SPEED = (0.15, 0.4), 0.1, (0.15, 0.4), 0.4, 2.0

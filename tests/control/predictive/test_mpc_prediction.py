@@ -24,7 +24,7 @@ from jaxbeam.control.prediction import (
 from tests.control.optimal import test_crossing_lqr as crossing
 from tests.control.predictive import test_mpc_exact as exact
 from tests.loop_as_oracle import span_of
-from tests.oracles.held_period import over_period
+from tests.oracles.sampled_plant import over_period
 
 
 def plant(states=4, inputs=2, outputs=2, seed=0):

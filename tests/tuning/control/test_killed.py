@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import tuning
-from tests.tuning.small_rig import GAIN, rig
-from tests.tuning.stand_in import fit, least_squares
+from tests.tuning.small_rig import GAIN, fit, least_squares, rig
 from tuning import checkpoint
 from tuning.checkpoint import Checkpoint
 from tuning.fit.least_squares import multi_start
@@ -21,7 +20,7 @@ CHILD = """
 import os, signal, sys
 import tuning.checkpoint
 from pathlib import Path
-from tests.tuning import stand_in
+from tests.tuning import small_rig
 from tests.tuning.control import test_killed
 from tuning.checkpoint import Checkpoint
 from tuning.fit.least_squares import multi_start
@@ -35,11 +34,11 @@ tuning.checkpoint.save = save_and_die
 {task}
 """
 SEARCH = """
-problem = stand_in.least_squares()
+problem = small_rig.least_squares()
 multi_start(problem, problem.data.measured, 12, 1, Checkpoint(file, "digest"))
 """
 TUNE = "test_killed.tuned(file)"
-SAMPLE = "sample(stand_in.fit(), 200, 2, 50, checkpoint=file)"
+SAMPLE = "sample(small_rig.fit(), 200, 2, 50, checkpoint=file)"
 
 
 def killed(task, file):

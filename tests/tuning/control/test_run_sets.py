@@ -14,8 +14,7 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import simulate_histories
-from tests.tuning.small_rig import GAIN as PLANT_GAIN, RIGIDITY, rig
-from tests.tuning.stand_in import CASE as PLANT_CASE, fit
+from tests.tuning.small_rig import CASE as PLANT_CASE, GAIN as PLANT_GAIN, RIGIDITY, fit, rig
 from tuning.control import run_set
 from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import make_run_set, run_case, run_cases

@@ -11,8 +11,7 @@ import tuning
 import tuning.fit.result
 from jaxbeam.analysis import stability
 from jaxbeam.cli import main
-from tests.tuning.small_rig import GAIN, RIGIDITY, rig
-from tests.tuning.stand_in import dataset, fit, least_squares
+from tests.tuning.small_rig import GAIN, RIGIDITY, dataset, fit, least_squares, rig
 
 LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
 TUNE = f"tune case.toml --cases loads.toml --free {GAIN}=500:7500 --no-least-peaks --steps 2"

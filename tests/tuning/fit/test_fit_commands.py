@@ -9,7 +9,7 @@ import pytest
 import tuning
 from jaxbeam.cli import main
 from tests.cli.example import CASE
-from tests.tuning import stand_in
+from tests.tuning import small_rig
 from tests.tuning.fit import test_frequency_responses
 from tuning.fit.experiment_design import ExperimentDesign
 from tuning.fit.model_validation import HeldOutPrediction
@@ -19,7 +19,7 @@ __all__ = ["call"]
 
 
 def test_weighing(call, tmp_path, monkeypatch):
-    fit = stand_in.fit()
+    fit = small_rig.fit()
     arguments = {}
 
     class Weighed:
@@ -93,8 +93,8 @@ def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
 
 def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
     """The criteria printed are those of the library; superfluous parameters raise them."""
-    held = stand_in.least_squares({"beam.flexural_rigidity": None})
-    fits = {"three": stand_in.fit(), "one": stand_in.fit(held)}
+    held = small_rig.least_squares({"beam.flexural_rigidity": None})
+    fits = {"three": small_rig.fit(), "one": small_rig.fit(held)}
     for name in fits:
         (tmp_path / f"{name}.npz").touch()
     monkeypatch.setattr(tuning, "load_fit", lambda path: fits[path.stem])
@@ -208,7 +208,7 @@ def test_a_fit_with_all_options(call, tmp_path, monkeypatch):
 
     def identify(case, logs, free, **settings):
         arguments.update(case=case, logs=logs, free=free, settings=settings)
-        return stand_in.fit()
+        return small_rig.fit()
 
     monkeypatch.setattr(tuning, "identify", identify)
     code, out, err = call(
@@ -236,7 +236,7 @@ def test_a_fit_with_all_options(call, tmp_path, monkeypatch):
 
 
 def test_json(call, monkeypatch):
-    monkeypatch.setattr(tuning, "identify", lambda *given, **settings: stand_in.fit())
+    monkeypatch.setattr(tuning, "identify", lambda *given, **settings: small_rig.fit())
     code, out, _ = call(
         "identify case.toml runs.csv --free beam.length --mask missing --json"
         " --profile sensors.0.offset --validate --draws 4"
@@ -246,7 +246,7 @@ def test_json(call, monkeypatch):
     assert len(result["posterior"]) > 1
     low, high = result["profiles"]["sensors.0.offset"]["interval"]
     assert low < 0.2 < high
-    assert set(result["numbers"]) == set(stand_in.TRUTH)
+    assert set(result["numbers"]) == set(small_rig.TRUTH)
 
 
 REFUSED = [

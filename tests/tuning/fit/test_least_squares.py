@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from tests.tuning.stand_in import (
+from tests.tuning.small_rig import (
     AMPLITUDES,
     CASE,
     NOISE,

@@ -15,7 +15,7 @@ from jaxbeam.case.case import replace
 from jaxbeam.files.case_file import case_to_dict
 from tests.oracles import finite_elements
 from tests.tuning.finite_element_rigs import SAGGING, SHAKER, SimulatedIdentification, plant
-from tests.tuning.stand_in import (
+from tests.tuning.small_rig import (
     AMPLITUDES,
     CASE,
     NOISE,
