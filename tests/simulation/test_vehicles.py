@@ -300,18 +300,6 @@ def test_travel_to_the_left_mirrors():
     assert_close(left.body_displacement, right.body_displacement, 1e-11)
 
 
-def test_a_table_of_positions_is_the_braking_that_it_lists():
-    """A cubic spline through a parabola is the parabola."""
-    profile = jb.profiles.SineProfile(4e-3, 6.0, 0.7)
-    braking = jb.QuarterCar(**CAR, speed=20.0, start_position=-4.0, deceleration=3.0)
-    times = np.linspace(0.0, 1.6, 9)
-    positions = -4.0 + 20.0 * times - 1.5 * times**2
-    table = jb.QuarterCar(**CAR, times=times, positions=positions)
-    one, two = (jb.simulate(case_of(load, profile=profile), TIMES) for load in (braking, table))
-    assert_close(one.deflection, two.deflection, 1e-9)
-    assert_close(one.contact_force, two.contact_force, 1e-9)
-
-
 @pytest.mark.parametrize("start", [-8.0, -8.5])
 def test_a_load_begins_in_equilibrium_on_a_raised_surface(start):
     """It stays so on a level part, raised by 0.1 m before the beam, until it meets the slope."""
