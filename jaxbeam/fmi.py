@@ -17,6 +17,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
@@ -321,6 +322,7 @@ STEPS = {
 INPUTS = {"beam": "commands, readings", "controller": "readings, commands"}
 
 
+@checks_classes
 def write_fmu(case: Case, path: str | os.PathLike, part: str = "beam", overwrite=False) -> Path:
     """Write the beam or the controller of a case as a unit for co-simulation by FMI 3.0.
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, suggestion
 from jaxbeam.model.modes import Modes, modes
@@ -39,6 +39,7 @@ def _warburton(mu):
 RULES = {"den-hartog": _den_hartog, "warburton": _warburton}
 
 
+@checks_classes
 def tuned_absorber(
     case: Case,
     position: Float[Array, ""] | float,
@@ -61,7 +62,6 @@ def tuned_absorber(
     3.485 Hz, 0.0857
     """
     check_is_case(case)
-    check_classes(tuned_absorber, mode=mode, rule=rule)
     if rule not in RULES:
         raise ValueError(f"rule cannot be {rule!r}; {suggestion(rule, RULES)}")
     check_on_beam("position", position, case.beam.length)

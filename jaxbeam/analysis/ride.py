@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.fields import concrete, is_concrete, real_numbers
 from jaxbeam.runtime.arrays import Array, not_differentiated, xp
 from jaxbeam.simulation.record import Record
@@ -175,6 +176,7 @@ def sperling_index(
     return xp.sum((CENTIMETRES * weight * amplitude) ** 2, axis=0) ** SPERLING_EXPONENT
 
 
+@checks_classes
 def wheel_unloading(record: Record) -> Float[Array, " load"]:
     """Largest fraction dQ/Q by which the contact force of each wheel falls below its static load.
 
@@ -224,6 +226,7 @@ class RideMeasures(NamedTuple):
     wheel_unloading: Float[Array, " load"]
 
 
+@checks_classes
 def ride_measures(record: Record) -> RideMeasures:
     """Weighted rms (m/s^2), dose (m/s^1.75) and Sperling's index by body, unloading by wheel.
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic, PortSignal
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import (
@@ -48,6 +48,7 @@ from jaxbeam.simulation.record import Record, envelope_headline, with_unit
 from jaxbeam.simulation.simulate import integration_setup, run_integration
 
 
+@checks_classes
 def corrected_deflection(record: Record, x, derivative: int = 0) -> Float[Array, "time *position"]:
     """Statically corrected history of a record's deflection at x (m), in m.
 
@@ -184,6 +185,7 @@ class Envelope(TableViews, Module):
         return iter((self.lowest, self.highest))
 
 
+@checks_classes
 def envelope(
     case: Case,
     x=None,
@@ -215,7 +217,6 @@ def envelope(
     >>> print(f"{1e3 * low[0]:.2f} mm")
     -2.00 mm
     """
-    check_classes(envelope, case=case, quantity=quantity)
     quantity_of(quantity, fibre_distance, section_modulus)
     plan = dataclasses.replace(integration_plan(case, tolerance=tolerance), error=0.0)
     calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope
@@ -282,6 +283,7 @@ _open_loop_envelope = compiled_if_traced(_envelope)
 _closed_loop_envelope = compiled(_envelope)
 
 
+@checks_classes
 def amplification(
     case: Case,
     x,

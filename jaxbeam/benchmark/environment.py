@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbeam.benchmark.problem import LOAD_STREAM, BenchmarkProblem
 from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
@@ -131,6 +132,7 @@ class Environment(Module):
     problem: BenchmarkProblem = eqx.field(static=True)
     prepared: _PreparedLoop = eqx.field(static=True)
 
+    @checks_classes
     def __init__(self, problem: BenchmarkProblem):
         case, controller = problem.case, problem.case.controller
         _check(case)
@@ -187,6 +189,7 @@ class Environment(Module):
         state = state._replace(uncontrolled=self._peak_without_commands(state))
         return self._observed(state, 0)
 
+    @checks_classes
     def step(
         self, state: EnvironmentState, action: Any
     ) -> tuple[EnvironmentState, Float[Array, " observation"], Float[Array, ""], Any]:

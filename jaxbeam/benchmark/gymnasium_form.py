@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxbeam.benchmark.environment import Environment
 from jaxbeam.benchmark.problem import BenchmarkProblem, load
+from jaxbeam.case.arguments import checks_classes
 
 try:
     import gymnasium
@@ -34,6 +35,7 @@ class GymnasiumEnvironment(gymnasium.Env):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
+    @checks_classes
     def __init__(self, problem: str | BenchmarkProblem):
         self.problem = load(problem) if isinstance(problem, str) else problem
         self.environment = Environment(self.problem)
@@ -47,6 +49,7 @@ class GymnasiumEnvironment(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-largest, largest, dtype=np.float64)
         self.state = None
 
+    @checks_classes
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Observation at the start of a run, and its info."""
         super().reset(seed=seed)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.controller import commanded
 from jaxbeam.files.case_file import load_case
@@ -85,6 +86,7 @@ def names() -> tuple[str, ...]:
     return tuple(_tables())
 
 
+@checks_classes
 @functools.cache
 def load(name: str) -> BenchmarkProblem:
     """Benchmark problem of a name.

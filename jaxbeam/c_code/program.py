@@ -34,6 +34,7 @@ from jaxbeam.c_code.translation import (
     with_numbers,
     without_unused,
 )
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, kind_of
@@ -423,6 +424,7 @@ class CProgram(NamedTuple):
     samples: int
 
 
+@checks_classes
 def export_c(case: Case, name: str) -> CProgram:
     """Program in C99 of the controller of a case, with its estimator, filters, limits and delay.
 
@@ -470,6 +472,7 @@ def export_c(case: Case, name: str) -> CProgram:
     return CProgram(files, text.operations, text.state_bytes, text.constant_bytes, len(loop.times))
 
 
+@checks_classes
 def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = False) -> list[Path]:
     """Paths of the files of a program, written to a folder.
 

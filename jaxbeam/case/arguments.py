@@ -10,14 +10,16 @@ import os
 import reprlib
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+F = typing.TypeVar("F", bound=Callable)
 OWN_PACKAGES = ("jaxbeam.", "tuning.")
 MAKERS = {  # how a newcomer comes by an object of a class
     "Case": "make one of parts by jaxbeam.Case(beam, ...), of a file by jaxbeam.load_case(path)",
+    "Layout": "jaxbeam.model.modes.mesh_layout(case) returns one",
     "Log": "tuning.read_log(path) reads one",
     "LoadCases": "make one by tuning.LoadCases(training, held_out) or tuning.full_grid(values)",
     "Fit": "tuning.identify makes one, tuning.load_fit(path) reads one",
@@ -30,16 +32,18 @@ SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10
 WORDS = {bool: "True or False", int: "a whole number", str: "a word", type(None): "None"}
 
 
-def check_classes(function: Callable, **given: Any) -> None:
-    """Compare arguments given to a function, by name, with the classes that it declares.
+def checks_classes(function: F) -> F:
+    """Decorator of a public function: its arguments are first compared with what it declares.
 
-    Raises TypeError for the first of another class.
+    The function raises TypeError for the first argument of another class, in one sentence.
     """
-    declarations = _signature(function).parameters
-    for name, value in given.items():
-        declared = declarations[name].annotation
-        if not fits(value, declared):
-            raise TypeError(wrong_class(name, value, declared))
+
+    @functools.wraps(function)
+    def checked(*args, **kwargs):
+        check_call(function, args, kwargs)
+        return function(*args, **kwargs)
+
+    return typing.cast(F, checked)
 
 
 def check_call(function: Callable, arguments: tuple, keywords: Mapping[str, Any]) -> None:
@@ -47,11 +51,15 @@ def check_call(function: Callable, arguments: tuple, keywords: Mapping[str, Any]
 
     Raises TypeError for the first of another class; of one too many the function itself says so.
     """
+    signature = _signature(function)
     try:
-        given = _signature(function).bind(*arguments, **keywords).arguments
+        given = signature.bind(*arguments, **keywords).arguments
     except TypeError:
         return
-    check_classes(function, **given)
+    for name, value in given.items():
+        declared = signature.parameters[name].annotation
+        if not fits(value, declared):
+            raise TypeError(wrong_class(name, value, declared))
 
 
 @functools.cache
@@ -70,7 +78,7 @@ def fits(value: Any, declared: Any) -> bool:
     if origin in (Sequence, tuple, list):
         if parts in ((float,), (float, Ellipsis)):
             return True
-        if isinstance(value, str | Mapping) or not hasattr(value, "__iter__"):
+        if isinstance(value, str | Mapping | Iterator) or not hasattr(value, "__iter__"):
             return False
         if origin is tuple and Ellipsis not in parts:
             return isinstance(value, Collection) and len(value) == len(parts)

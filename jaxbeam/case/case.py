@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
-from jaxbeam.case.arguments import describe_value, wrong_class
+from jaxbeam.case.arguments import checks_classes, describe_value, wrong_class
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.contact import AbstractContact
 from jaxbeam.case.controller import AbstractController
@@ -189,6 +189,7 @@ class Case(Module):
         """Loads, then absorbers: the parts with wheels, in the order of the wheels."""
         return (*self.loads, *self.absorbers)
 
+    @checks_classes
     def trajectory(self, load: AbstractLoad | Absorber) -> AbstractPiecewiseTrajectory:
         """Trajectory of the first wheel of a load of the case."""
         travels = isinstance(load, AbstractLoad) and load.speed is not None
@@ -273,6 +274,7 @@ def _addresses_of(structure) -> list[str]:
     return [".".join(map(_key_name, path)) for path, _ in paths]
 
 
+@checks_classes
 def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     """All numbers of a case by address, in SI units.
 
@@ -408,6 +410,7 @@ def unit_at(case: Case, address: str) -> str:
     return unit
 
 
+@checks_classes
 def replace(case: Case, values: dict[str, Any]) -> Case:
     """A copy of a case with other numbers at some addresses (SI units, or as text with a unit).
 
@@ -423,12 +426,6 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     >>> print(jb.replace(case, {"loads.0.mass": 0.2}).loads[0].mass)
     0.2
     """
-    check_is_case(case)
-    if not isinstance(values, Mapping):
-        raise ValueError(
-            "values map addresses to numbers, as {'loads.0.mass': 0.2}, not"
-            f" {describe_value(values)}"
-        )
     leaves, structure = jax.tree.flatten(case)
     index = {address: i for i, address in enumerate(_addresses_of(structure))}
     numbers = dict(zip(index, leaves, strict=True))

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
@@ -60,6 +61,7 @@ class ReceptanceFeedback(Module):
     delay: Float[Array, ""]
     actuator: int = eqx.field(static=True, default=0)
 
+    @checks_classes
     def controller(self, case: Case, period: float | None = None) -> OutputFeedback:
         """Controller of a case whose sensors measure the deflections, then their velocities.
 
@@ -84,6 +86,7 @@ class ReceptanceFeedback(Module):
         return OutputFeedback(gains=gains, period=period, delay=self.delay if delay else None)
 
 
+@checks_classes
 def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor"]:
     """Deflections at the sensors per command of an actuator, at complex s (1/s), in m per command.
 
@@ -110,6 +113,7 @@ def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor
     return states[:, model.coordinate_index] @ _sensor_shapes(case, model).T
 
 
+@checks_classes
 def fit_receptances(
     frequencies: ArrayLike, values: ArrayLike, tolerance: float = 1e-9
 ) -> Callable[[ArrayLike], Complex[np.ndarray, "pole sensor"]]:
@@ -143,6 +147,7 @@ def fit_receptances(
     return lambda s: np.stack([fit(np.asarray(s, complex)) for fit in fits], axis=-1)
 
 
+@checks_classes
 def receptance_gains(
     assigned: ArrayLike,
     poles: ArrayLike,
@@ -202,6 +207,7 @@ def receptance_gains(
     return ReceptanceFeedback(gains[:count], gains[count:] / scale, xp.asarray(delay), actuator)
 
 
+@checks_classes
 def receptance_feedback(
     case: Case,
     poles: ArrayLike,

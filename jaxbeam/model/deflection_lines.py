@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.arguments import describe_value
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import check_on_beam, concrete, is_concrete, real_numbers
 from jaxbeam.case.sensors import TWIST, TWIST_RATE
@@ -113,6 +113,7 @@ def influence_line(
     return unchecked_influence_line(case, layout, x, load_positions, derivative)
 
 
+@checks_classes
 def static_deflection(
     case: Case,
     x,
@@ -282,10 +283,6 @@ def validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
     Raises ValueError as `influence_line` does.
     """
     check_case(case)
-    if not isinstance(layout, Layout | None):
-        raise ValueError(
-            f"layout takes what mesh_layout(case) returns, or None, not {describe_value(layout)}"
-        )
     for name, position in positions.items():
         check_on_beam(name, position, case.beam.length)
     layout = mesh_layout(case) if layout is None else layout

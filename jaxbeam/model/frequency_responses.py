@@ -34,7 +34,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import (
     check_on_beam,
@@ -369,6 +369,7 @@ class FrequencyResponse(TableViews, Module):
             {"title": self.title},
         )
 
+    @checks_classes
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
 
@@ -378,6 +379,7 @@ class FrequencyResponse(TableViews, Module):
             self.to_xarray().to_netcdf(partial, engine="scipy")
 
 
+@checks_classes
 def frequency_response(
     case: Case,
     frequencies,
@@ -408,7 +410,6 @@ def frequency_response(
     >>> print(responses.values.shape)  # frequency, pair
     (2, 1)
     """
-    check_classes(frequency_response, case=case, pairs=pairs, layout=layout)
     check_case(case)
     frequencies, masses = (
         _checked_frequencies(frequencies),
@@ -488,6 +489,7 @@ def descriptor_matrices(case: Case, model: ModalModel, stationary):
     return A, E
 
 
+@checks_classes
 def receptance(
     case: Case,
     frequencies,
@@ -528,6 +530,7 @@ def _receptance(case: Case, layout: Layout, frequencies, stationary, x, y):
     return response.reshape(frequencies.size, *x.shape, *y.shape)
 
 
+@checks_classes
 def mobility(
     case: Case,
     frequencies,
@@ -549,6 +552,7 @@ def mobility(
     return _differentiated(frequencies, response)
 
 
+@checks_classes
 def accelerance(
     case: Case,
     frequencies,

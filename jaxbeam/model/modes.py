@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.beam import MATERIALS, Beam
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
@@ -299,6 +299,7 @@ def mesh_layout(case: Case) -> Layout:
     return layout
 
 
+@checks_classes
 @jax.named_scope("modes")
 def modes(case: Case, layout: Layout | None = None) -> Modes:
     """Lowest `case.beam.modes` natural modes of the beam on its supports.
@@ -318,7 +319,6 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     >>> print(jb.modes(jb.Case(beam)).frequencies.round(2))
     [ 20.39  81.55 183.49]
     """
-    check_classes(modes, case=case, layout=layout)
     if layout is None:
         check_plant(case)
         layout = mesh_layout(case)

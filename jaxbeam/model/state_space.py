@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import OUTSIDE, concrete, is_concrete, refuse_traced, refuses_traced
@@ -438,6 +438,7 @@ def _command_signals(plant: Plant) -> tuple[Signal, ...]:
     return tuple(Signal(f"command_{i}", actuators[i].command_unit) for i in numbers)
 
 
+@checks_classes
 def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> Plant:
     """State space of a case: beam, supports, absorbers, actuators, loads; not its controller.
 
@@ -457,7 +458,6 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     >>> print(jb.state_space(case).at(0.1).A.shape)
     (6, 6)
     """
-    check_classes(state_space, case=case, coordinates=coordinates, layout=layout)
     if layout is None:
         check_plant(case)
     return build_plant(case, compiled_modal_model(case, layout), coordinates)

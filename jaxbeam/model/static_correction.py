@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
@@ -215,6 +216,7 @@ def is_supported(case: Case, layout: Layout) -> bool:
 # Section forces
 
 
+@checks_classes
 def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "..."]:
     """Bending moment of the section at x (m), patches included, in N m; sagging is positive.
 
@@ -250,6 +252,7 @@ def active_moments(case: Case, x) -> Float[Array, "actuator *position"]:
     return xp.array(moments).reshape(-1, *x.shape)
 
 
+@checks_classes
 def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
     """Shear force of the section at x (m) in N: the x-derivative of the bending moment.
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.fields import check_on_beam, concrete, real_numbers, suggestion
 from jaxbeam.case.sensors import QUANTITIES, SIDES, SLOPE, quantity_of
@@ -46,6 +46,7 @@ def unit_of_effect(quantity: str) -> str:
     return "N" if quantity == REACTION else QUANTITIES[quantity].unit
 
 
+@checks_classes
 def influence_line(
     case: Case,
     x,
@@ -85,7 +86,6 @@ def influence_line(
     [0.25 0.5 ]
     """
     check_is_case(case)
-    check_classes(influence_line, layout=layout, quantity=quantity, side=side)
     if load_positions is None:
         load_positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
     x = real_numbers("x", x, "m", "positions")
@@ -97,6 +97,7 @@ def influence_line(
     return _influence_line(case, layout, x, load_positions, kind, fibre_distance, section_modulus)
 
 
+@checks_classes
 def static_peak(
     case: Case,
     x,

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import check_on_beam, concrete, is_concrete
 from jaxbeam.case.profiles.shapes import AbstractProfile
@@ -510,6 +511,7 @@ def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> 
     return SettledBeam(system.transfer, states, length)
 
 
+@checks_classes
 def settlement_response(
     case: Case, settlements, x, derivative: int = 0
 ) -> Float[Array, "*position"]:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import concrete, is_concrete, real_numbers, refuse_traced, refuses_traced
@@ -332,6 +333,7 @@ class Record(RecordViews):
             self.command if self.acting_command is None else self.acting_command,
         )
 
+    @checks_classes
     def at(
         self, x, quantity: str = "deflection", fibre_distance=None, section_modulus=None
     ) -> Float[Array, "time ..."]:
@@ -352,6 +354,7 @@ class Record(RecordViews):
         """Bending moment at positions x (m) in N m, positive where the beam sags: E I w_xx."""
         return self.at(x, "moment")
 
+    @checks_classes
     def shear_force(self, x, side: str = "right") -> Float[Array, "time ..."]:
         """Shear force dM/dx at positions x (m) in N, just "right" or "left" of each.
 
@@ -371,6 +374,7 @@ class Record(RecordViews):
         """Positions (m) of held ends and supports, from left to right."""
         return section_forces.support_positions(self.case, self.modes)
 
+    @checks_classes
     def envelope(
         self,
         quantity: str = "moment",

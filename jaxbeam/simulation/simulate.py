@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.arguments import check_classes
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, check_is_case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.controller import AbstractController
@@ -96,6 +96,7 @@ class ContactLossWarning(UserWarning):
     """Warning of a negative contact force, at which the load would lift off the beam."""
 
 
+@checks_classes
 def simulate(
     case: Case,
     times: Float[Array, " time"] | None = None,
@@ -131,7 +132,6 @@ def simulate(
     2.00 mm
     """
     check_is_case(case)
-    check_classes(simulate, plan=plan)
     if times is not None:
         check_times(times)
     sampling = case.run.duration, case.run.sample_rate

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict
@@ -125,6 +126,7 @@ def _with_extremes(dataset: "xarray.Dataset", case: Case) -> "xarray.Dataset":
     return dataset.assign(found)
 
 
+@checks_classes
 def read_record(path: str | os.PathLike) -> Record:
     """Record from a netCDF file or zarr store written by `Record.save`.
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import concrete, refuses_traced
@@ -463,6 +464,7 @@ class RecordViews(TableViews, Module):
         histories = self.sensor_values, self.contact_force, self.command
         return record_columns(self.case, self.times, *histories)
 
+    @checks_classes
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write all of the record to .nc or .zarr, or its `columns` to .csv, .xlsx, .mat, .parquet.
 
@@ -475,6 +477,7 @@ class RecordViews(TableViews, Module):
         else:
             write_result(path, lambda: self.columns, self.to_xarray, overwrite)
 
+    @checks_classes
     def to_html(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write an interactive figure of the histories, a page in one file, for any browser.
 
@@ -486,6 +489,7 @@ class RecordViews(TableViews, Module):
         with whole_file(path, overwrite) as partial:
             partial.write_text(page, encoding="utf-8")
 
+    @checks_classes
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
 

@@ -61,7 +61,7 @@ asked = [
     ),
     (lambda word: jb.ride.weighted_rms(word, [1.0]), "times takes numbers in s"),
     (lambda word: jb.ride.sperling_index([0.0], word), "acceleration takes numbers in m/s^2"),
-    (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes what mesh_layout"),
+    (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes a jaxbeam.Layout or"),
     (lambda word: jb.influence_line(case, 0.5, layout=word), "layout takes a jaxbeam.Layout or"),
     (lambda word: jb.modes(case, word), "layout takes a jaxbeam.Layout or None"),
     (lambda word: jb.simulate(case, plan=word), "plan takes a jaxbeam.IntegrationPlan or None"),
@@ -70,7 +70,7 @@ asked = [
     (lambda word: jb.assess(case, 40.0, dynamic=word), "dynamic takes True or False or None"),
     (lambda word: jb.bound(case, spacing=word), "spacing must be a real number"),
     (lambda word: jb.save(jb.simulate(case), "x.csv", word), "overwrite takes True or False"),
-    (lambda word: jb.replace(case, word), "values map addresses to numbers"),
+    (lambda word: jb.replace(case, word), "values takes a mapping by names"),
 ]
 for ask, message in asked:
     try:
@@ -131,3 +131,72 @@ for ask, message in of_a_word:
 def test_it_is_said_of_what_class_an_argument_of_a_fit_is():
     """It was said that a str has no `valid`, and words were taken as True."""
     subprocess.run([sys.executable, "-c", TUNING], check=True, cwd=ROOT)
+
+
+EVERY = """
+import inspect, types, typing
+from importlib import import_module
+import jaxbeam, tuning
+from jaxbeam.case.arguments import fits
+
+OTHERS = ("c_code", "fmi", "files.export", "plot", "benchmark", "rigs")
+PARTS = ("jaxbeam.case.", "jaxbeam.control.", "jaxbeam.estimation.", "tuning.control.")  # of cases
+FITTING = {int: 1, bool: False, str: "x"}
+modules = [jaxbeam, tuning, *(import_module(f"jaxbeam.{name}") for name in OTHERS)]
+modules += [one for m in modules[:2] for n in m.__all__ if inspect.ismodule(one := getattr(m, n))]
+
+
+def names_of(module):
+    own = {n for n, one in vars(module).items() if getattr(one, "__module__", 0) == module.__name__}
+    return getattr(module, "__all__", [name for name in own if not name.startswith("_")])
+
+
+public = {f"{m.__name__}.{name}": getattr(m, name) for m in modules for name in names_of(m)}
+
+
+def value_of(declared):
+    "One of a declared class that is good for nothing else."
+    origin, parts = typing.get_origin(declared), typing.get_args(declared)
+    if origin in (typing.Union, types.UnionType):
+        return value_of(parts[0])
+    if origin is not None:
+        return next((one for one in ([], {}, print) if fits(one, declared)), parts)
+    if not str(getattr(declared, "__module__", "")).startswith(("jaxbeam.", "tuning.")):
+        return FITTING.get(declared, 0.5)
+    return (tuple if issubclass(declared, tuple) else object).__new__(declared)
+
+
+calls = {}
+for name, one in public.items():
+    if not inspect.isclass(one):
+        calls |= {name: (one, None)} if callable(one) else {}
+    elif not one.__module__.startswith(PARTS):  # whose methods are called by the rest
+        methods = inspect.getmembers(one, inspect.isfunction)
+        calls |= {f"{name}.{key}": (m, one) for key, m in methods if not key.startswith("_")}
+checked = 0
+for name, (function, owner) in calls.items():
+    declared = {n: p for n, p in inspect.signature(function).parameters.items() if n != "self"}
+    first = [value_of(owner)] * (owner is not None)
+    needed = {n: value_of(p.annotation) for n, p in declared.items() if p.default is p.empty}
+    for argument, declaration in declared.items():
+        for value in (3, "x", types, [types]):
+            if fits(value, declaration.annotation):
+                continue
+            try:
+                function(*first, **needed | {argument: value})
+            except (TypeError, ValueError) as error:
+                place = error.__traceback__
+                while place.tb_next:
+                    place = place.tb_next
+                file = place.tb_frame.f_code.co_filename
+                assert "/jaxbeam/" in file or "/tuning/" in file, (name, argument, value, error)
+                checked += 1
+            else:
+                raise AssertionError((name, argument, value))
+assert checked > 1000
+"""
+
+
+def test_every_public_function_says_of_what_class_its_arguments_are():
+    """Names of exports, paths and records of other classes ended in an AttributeError."""
+    subprocess.run([sys.executable, "-c", EVERY], check=True, cwd=ROOT)

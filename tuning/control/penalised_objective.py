@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.linearised_loop import linearise, loop_dynamics, loop_timing
+from jaxbeam.case.arguments import check_call
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array
@@ -31,7 +32,8 @@ class StabilityConstraint:
     cost more than runs, `crossings` (values by address, like load cases) may replace the training
     runs.
 
-    Raises ValueError for a negative delay, less than one instant and fractions outside 0 to 1.
+    Raises ValueError for a negative delay, less than one instant and fractions outside 0 to 1, and
+    TypeError for fields of other classes.
 
     >>> import tuning
     >>> stable = tuning.StabilityConstraint(max_real_part=-1.0, extra_delay=0.001)
@@ -46,6 +48,7 @@ class StabilityConstraint:
     crossings: tuple[AddressValues, ...] = ()
 
     def __post_init__(self):
+        check_call(type(self), (), vars(self))
         if self.extra_delay < 0 or self.instants < 1:
             raise ValueError("stable needs a delay that is not negative, and at least one instant")
         if any(not 0 < fraction < 1 for fraction in self.parameter_tolerance.values()):

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak, no_bound
-from jaxbeam.case.arguments import describe_value
+from jaxbeam.case.arguments import checks_classes, describe_value
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, unit_at, value_at
 from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
@@ -83,6 +83,7 @@ class LoadCases:
                 f"held-out cases must not be trained on, but {_describe(repeated[0])} is"
             )
 
+    @checks_classes
     def across(
         self, plants: Sequence[AddressValues], others: Sequence[AddressValues] = ()
     ) -> "LoadCases":
@@ -141,6 +142,7 @@ def latin_hypercube(
     return tuple(dict(zip(ranges, map(float, row), strict=True)) for row in rows)
 
 
+@checks_classes
 def read_load_cases(path: str | os.PathLike, case: Case | None = None) -> LoadCases:
     r"""Read load cases from a TOML file with tables [training] and [held_out].
 

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Complex, Float
 
+from jaxbeam.case.arguments import check_call, checks_classes
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import OUTSIDE, refuse_traced, refuses_traced
 from jaxbeam.model.frequency_responses import StationaryMasses, frequency_response
@@ -36,7 +37,7 @@ class Responses:
     same for all if left out. `stationary_masses` are (position in m, mass in kg) each.
 
     Raises ValueError if shapes disagree, frequencies do not ascend from above zero, or a value is
-    zero or not finite.
+    zero or not finite, and TypeError for fields of other classes.
 
     >>> import numpy as np
     >>> import tuning
@@ -57,6 +58,7 @@ class Responses:
     source: str = "responses"
 
     def __post_init__(self):
+        check_call(type(self), (), vars(self))
         refuse_traced("a measured response", OUTSIDE, self.frequencies, self.values)
         if self.values.shape != (self.frequencies.size, len(self.pairs)):
             raise ValueError(
@@ -74,6 +76,7 @@ class Responses:
             )
 
 
+@checks_classes
 def responses_of(log: Log, segment: float | None = None, min_coherence: float = 0.8) -> Responses:
     """Frequency responses of the sensors in a log to the one command in it.
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import unit_of
@@ -465,6 +466,7 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
     save(path, FORMAT, arrays | {"about": np.array(json.dumps(header))}, overwrite)
 
 
+@checks_classes
 def load_fit(path: str | os.PathLike) -> Fit:
     """Fit from a file written by `save_fit`.
 

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
 from scipy.signal import resample_poly
 
+from jaxbeam.case.arguments import checks_classes
 from tuning.logs.log import GAP_STEPS, Log, between_gaps
 from tuning.logs.units import STANDARD_GRAVITY
 
@@ -156,6 +157,7 @@ class Fault:
         return self.message
 
 
+@checks_classes
 def find_faults(log: Log) -> list[Fault]:
     """Gaps, clock drift, offsets, held readings, spikes, and missing, clipped and stuck samples.
 
@@ -175,6 +177,7 @@ def find_faults(log: Log) -> list[Fault]:
     return found
 
 
+@checks_classes
 def mask(log: Log, kinds: Sequence[str]) -> Log:
     """The log with samples that have some kinds of faults marked as not valid, for fits.
 

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.runtime.output_file import check_ending, whole_file
 from tuning.logs.log import Log
@@ -165,6 +166,7 @@ class ModalFit(ModalEstimates):
             ],
         }
 
+    @checks_classes
     def to_html(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the stabilisation diagram, in which modes are chosen by clicks, as a page.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.plot.style import ALARM, GREY, LIMIT_STYLE, colour, use_style
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, text_table
@@ -235,6 +236,7 @@ class Monitoring(TableViews):
             }
         return content
 
+    @checks_classes
     def plot(self, path: str | os.PathLike | None = None) -> Any:
         """Figure of the frequencies, what conditions explain of them, and the control chart.
 
@@ -257,6 +259,7 @@ def _goes_on(before: ModeTrack, after: ModeTrack) -> bool:
     return before.last < after.born and step <= float(np.log1p(MAX_STEP))
 
 
+@checks_classes
 def monitor(
     folder: str | os.PathLike,
     store: str | os.PathLike,

@@ -18,6 +18,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.sensors import Sensor
@@ -206,6 +207,7 @@ class InfluenceLines(NamedTuple):
         own = None if self.deviations is None else self.deviations[:, :, chosen]
         return self._replace(values=self.values[:, chosen], deviations=own)
 
+    @checks_classes
     def crossing(
         self, geometry: AxleGeometry, times: Float[np.ndarray, " time"]
     ) -> Float[np.ndarray, "time axle sensor"]:
@@ -218,6 +220,7 @@ class InfluenceLines(NamedTuple):
             )
         return found
 
+    @checks_classes
     def modulated(
         self,
         geometry: AxleGeometry,

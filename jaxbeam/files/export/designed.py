@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, kinds
@@ -193,6 +194,7 @@ def _index_and_fraction(grid: np.ndarray, value: float) -> tuple[int, float]:
 EXPORTABLE = (LQR, StateFeedback)
 
 
+@checks_classes
 def export_gains(case: Case, points: int = 1001) -> Gains:
     """Gains of the controller of a case, its constant-gain estimator and its sensors' filters.
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from jaxbeam.case.arguments import checks_classes
 from jaxbeam.files.export.designed import ARRAYS, Gains
 from jaxbeam.files.tables import as_text_cell
 from jaxbeam.runtime.input_file import check_input, describe_content
@@ -169,6 +170,7 @@ FORMAT = "jaxbeam gains 3"
 SECTION_COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
 
 
+@checks_classes
 def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write gains to a file with the suffix .csv, .mat, .tdms or .h, which selects the format.
 
@@ -183,6 +185,7 @@ def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) 
         partial.write_bytes(content)
 
 
+@checks_classes
 def read_gains(path: str | os.PathLike) -> Gains:
     """Gains of a .csv, .mat or .tdms file, with the same numbers to the last bit.
 
