@@ -29,6 +29,10 @@ from tests.c_code.cases import CASES as LOOPS, rig
 from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 from tuning import load_fit, read_logs
 
+# Cases of all kinds whose answers of version 0.2.0 are kept in `tests/data/release_0_2_0.json`.
+#
+# `python -m tests.simulation.release_cases` prints the answers of this version.
+
 # Their answers are those at a tolerance of 1e-12: 0.2.0 chose steps by another error of peaks
 # between them, too small for the mass on a ramp (1.2e-8 in its peak), too large for the half car.
 OTHER_STEPS = ("a mass on a ramp", "a half car")

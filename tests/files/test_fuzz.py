@@ -37,6 +37,8 @@ from tests.strategies.examples import (
 from tests.tuning.logs import test_readers as readers
 from tuning import read_logs
 
+# Random damage to files: changed trees of dictionaries and lists, and changed bytes.
+
 HOSTILE = (
     *(float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 5e-324, 0.0, -1, 0, 3, 10**19),
     *(10**400, True, "", "nan", "1", "mass", "pinned", "\x00", "é" * 200, 10**6),
@@ -117,6 +119,8 @@ def contents(draw, content: bytes) -> bytes:
             del changed[index:]
     return bytes(changed)
 
+
+# Random whole cases: all loads, vehicles, profiles, actuators, controllers and estimators.
 
 LENGTH = 0.6  # of the beam of the examples, m
 

@@ -27,6 +27,8 @@ from tests.oracles.closed_forms import (
 )
 from tests.oracles.finite_elements import assemble
 
+# Beams whose modes are tested, and their modes by one compiled program.
+
 PROPERTIES = {"flexural_rigidity": 11.68, "mass_per_length": 0.535}
 PAIRS = [f"{left}-{right}" for left in END_CONDITIONS for right in END_CONDITIONS]
 PATCHED = Case(

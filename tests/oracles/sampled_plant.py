@@ -139,6 +139,8 @@ def conditioned(
     )[-size:, -size:]
 
 
+# A time-varying plant x' = A(t) x + B(t) u over a period with held inputs u, by scipy.
+
 INSIDE = 1e-12  # s: matrices are taken so far inside an interval, as they jump at events
 
 

@@ -15,8 +15,7 @@ from experiments.thesis.cases import critical_speed, two_spans, with_modes, with
 from jaxbeam import rigs
 from jaxbeam.simulation import unilateral as lifting
 from jaxbeam.simulation.integration_plan import integration_plan
-from tests.oracles.lifting_wheels import Crossing, Wheel
-from tests.oracles.moreau_steps import moreau_steps
+from tests.oracles.lifting_wheels import Crossing, Wheel, moreau_steps
 
 UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0, "damping_ratio": 0.02}
 LIFTING = jb.UnilateralContact()

@@ -35,6 +35,8 @@ def rig(controller=None) -> jb.Case:
     )
 
 
+# A dataset whose readings are a formula, for tests of fits without simulation.
+
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
 AMPLITUDES = (1.0, 1.6, 0.7)  # initial deflection (m) in each log
 TIMES = np.arange(120) / 50.0

@@ -22,7 +22,7 @@ export async function begin(load, library, say) {
   say("the library is loaded");
   await python.runPythonAsync(`import micropip\nawait micropip.install(${JSON.stringify(PURE)})`);
   python.unpackArchive(await library(), "zip");
-  const ask = await python.runPythonAsync("from jaxbeam.app.in_browser import Page\nPage().ask");
+  const ask = await python.runPythonAsync("from jaxbeam.app.questions import Page\nPage().ask");
   say("");
   return (/** @type {string} */ name, /** @type {string} */ text) => {
     const found = ask(name, text);

@@ -105,6 +105,8 @@ def coordinate_map(names: tuple[str, ...], signs: dict[str, int]) -> np.ndarray:
     return np.array([[sign * (name == own) for own in names] for name, sign in signs.items()])
 
 
+# Runs of `tests/data/vehicle_runs.json` as cases, and their numbers at the stated times.
+
 DATA = json.loads((ROOT / "tests" / "data" / "vehicle_runs.json").read_text(encoding="utf-8"))
 RUNS = {run["case"]: run for run in DATA["runs"]}
 WAVES = json.loads((ROOT / "tests" / "data" / "profiles.json").read_text(encoding="utf-8"))

@@ -18,6 +18,8 @@ from jaxbeam.case.profiles.spectra import DIRECT_SIZE, RAIL_SPECTRA, ROAD_CLASSE
 from tests.differences import central
 from tests.modules import DATA
 
+# One profile of every kind, with and without a contact patch.
+
 POSITIONS = [-3.0, -1.0, 0.5, 1.0, 2.5, 4.0, 7.0]
 HEIGHTS = [0.0, 2e-3, -1e-3, 1e-3, 4e-3, 3e-3, 5e-3]
 
