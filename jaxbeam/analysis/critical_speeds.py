@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.base import AbstractVehicleLoad, wheel_distances
+from jaxbeam.case.loads.base import AbstractLoad, VaryingForce, wheel_distances
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import modes
 
@@ -149,33 +149,44 @@ def run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> li
 def with_run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> Case:
     """The case with its vehicles far enough before the bridge for their free motion to decay.
 
-    Those with springs that travel start on a level surface, from which the profile grows over 10 m,
-    the largest `run_up` of all loads before the bridge; the run lasts as much longer, at the
-    slowest of the `speeds`. Tables of times stay as they are. Raises ValueError as `run_up`, and
-    for vehicles from both ends.
+    The profile grows from a level surface over 10 m, the largest `run_up` of all loads before the
+    bridge. All loads come later by the time that the slowest vehicle with springs, at its own or
+    one of the `speeds`, takes from there to the bridge, so that they meet on it as they would; the
+    run lasts as much longer. Raises ValueError as `run_up`, and for vehicles from both ends.
     """
-    distance = max(run_up(case, share, speeds), default=0.0)
+    signed = [
+        float(concrete(load.speed))
+        for load, rate in zip(case.loads, decay_rates(case), strict=True)
+        if load.speed is not None and not math.isinf(rate)
+    ]
+    every = [*speeds, *signed]
+    distance = max(run_up(case, share, every), default=0.0)
     if distance == 0:
         return case
-    start, length, loads, delays = distance + SWITCH, float(concrete(case.beam.length)), [], [0.0]
-    signs = set()
-    for load, rate in zip(case.loads, decay_rates(case), strict=True):
-        if load.speed is None or math.isinf(rate) or not isinstance(load, AbstractVehicleLoad):
-            loads.append(load)
-            continue
-        speed = float(concrete(load.speed))
-        signs.add(speed < 0)
-        position = length + start if speed < 0 else -start
-        loads.append(dataclasses.replace(load, start_position=position))
-        delays.append(start / min((abs(v) for v in speeds), default=abs(speed)))
-    if len(signs) > 1:
+    start, length = distance + SWITCH, float(concrete(case.beam.length))
+    leftwards = {speed < 0 for speed in signed}
+    if len(leftwards) > 1:
         raise ValueError(
             "vehicles enter at both ends, and a profile grows from one: make a case of each, or"
             " give start_position and profile.switch_on"
         )
-    ends = (length + start, length + distance) if signs == {True} else (-start, -distance)
+    delay = start / min(map(abs, every))
+    ends = (length + start, length + distance) if leftwards == {True} else (-start, -distance)
     profile = case.profile
     if profile is not None and hasattr(profile, "switch_on"):
         profile = dataclasses.replace(profile, switch_on=ends)
-    run = dataclasses.replace(case.run, duration=case.run.duration + max(delays))
-    return dataclasses.replace(case, loads=tuple(loads), profile=profile, run=run)
+    loads = tuple(_later(load, delay) for load in case.loads)
+    run = dataclasses.replace(case.run, duration=case.run.duration + delay)
+    return dataclasses.replace(case, loads=loads, profile=profile, run=run)
+
+
+def _later(load: AbstractLoad, delay: float) -> AbstractLoad:
+    """The load with its motion and its forces a delay (s) later."""
+    names = ["entry_time" if load.times is None else "times", "step_time", "force_times"]
+    later = {
+        name: getattr(load, name) + delay for name in names if getattr(load, name, None) is not None
+    }
+    if isinstance(load, VaryingForce):
+        phases = 0.0 if load.phases is None else load.phases
+        later["phases"] = phases - 2 * np.pi * load.frequencies * delay
+    return dataclasses.replace(load, **later)

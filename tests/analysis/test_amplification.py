@@ -295,9 +295,42 @@ def test_speeds_of_a_sweep():
     """The fastest one decides on the distance, the slowest on the duration."""
     found = _with_run_up(ROUGH_CASE, {"loads.0.speed": ["36 km/h", "90 km/h"], "profile.seed": [1]})
     start = 10.0 + run_up(ROUGH_CASE, speeds=[25.0])[0]
-    assert found.loads[0].start_position == pytest.approx(-start)
+    slowest = dataclasses.replace(found.loads[0], speed=10.0).trajectory(np.array(20.0))
+    assert slowest.kinematics(np.zeros(()))[0] == pytest.approx(-start)
     assert found.profile.switch_on == pytest.approx([-start, 10.0 - start])
     assert float(found.run.duration) == pytest.approx(1.5 + start / 10.0)
+
+
+def test_loads_meet_on_the_bridge_as_without_a_run_up():
+    """Of other speeds, braking, without springs, by tables; all move as they would, but later."""
+    table = {"times": [0.0, 1.0, 2.0], "positions": [-3.0, 5.0, 9.0]}
+    loads = [
+        CAR,
+        dataclasses.replace(CAR, speed=12.0, entry_time=0.4, deceleration=3.0),
+        dataclasses.replace(CAR, speed=15.0, start_position=-4.0),
+        jb.MovingForce(force=1e3, speed=-30.0, entry_time=0.2),
+        jb.MovingMass(mass=100.0, **table),
+        jb.VaryingForce(
+            1e3, [2.0], [500.0], force_times=[0.1, 0.9], forces=[0.0, 2e3], position=7.0
+        ),
+        jb.Pedestrian(pace=1.8, speed=1.5, step_time=0.1),
+    ]
+    before = dataclasses.replace(ROUGH_CASE, loads=loads)
+    after = with_run_up(before)
+    delay = float(after.run.duration) - 1.5
+    assert delay == pytest.approx((run_up(ROUGH_CASE)[0] + 10.0) / 12.0)
+    times = np.linspace(0.0, 1.5, 31)
+    for one, other in zip(before.loads, after.loads, strict=True):
+        moved = one.trajectory(np.array(20.0)).kinematics(times)
+        assert_allclose(
+            other.trajectory(np.array(20.0)).kinematics(times + delay), moved, atol=1e-9
+        )
+        for wheel, history in one.force_histories().items():
+            later = other.force_histories()[wheel].at(times + delay)
+            assert_allclose(later, history.at(times), atol=1e-7)
+        if one.times is None and other.speed is not None and "Car" in type(one).__name__:
+            start = other.trajectory(np.array(20.0)).kinematics(np.zeros(()))[0]
+            assert start <= float(after.profile.switch_on[0]) + 1e-9
 
 
 def test_loads_that_need_none_and_refusals():
