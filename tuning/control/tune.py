@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import no_bound
 from jaxbeam.case.case import Case, check_distinct, each_address, list_sizes, replace
-from jaxbeam.case.fields import refuses_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.compiling import compiled
@@ -30,7 +30,7 @@ from tuning.control.run_set import (
     make_run_set,
     with_identified_plant,
 )
-from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
+from tuning.control.tuning_result import DETUNING, RunSetResult, StartResult, TuningResult
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty import Posterior
 from tuning.parameters import free_parameters
@@ -244,15 +244,17 @@ class TuningProblem:
             run_sets["held out"] = self.held_out_runs
         violation = 0.0 if self.violation is None else float(compiled(self.violation)(after))
         order = np.argsort(state.best_value).tolist()
+        tuned = replace(self.case, after)
+        detuned = [_detuned(tuned, after, self.cases, error) for error in DETUNING[1:]]
         return TuningResult(
-            case=replace(self.case, after),
+            case=tuned,
             parameters=self.parameters,
             values=values,
             objective=objective,
             history=state.history,
             rejected_steps=int(state.rejected.sum()),
             run_sets=[
-                _run_set_result(name, run_set, objective, before, after)
+                _run_set_result(name, run_set, objective, before, after, detuned)
                 for name, run_set in run_sets.items()
             ],
             stability_violation=violation,
@@ -268,19 +270,25 @@ def _metrics_of(run_set: RunSet, found: Histories):
     return run_set.metrics_of(found)
 
 
-def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetResult:
-    """True peaks and metrics of all runs before and after tuning, and their least peaks."""
+def _run_set_result(
+    name, run_set: RunSet, objective, before, after, detuned: Sequence[dict]
+) -> RunSetResult:
+    """True peaks and metrics of all runs before and after tuning, and their least peaks.
+
+    The objective is that of `detuned` values too, where the case has absorbers.
+    """
+    points = [before, after, *(detuned if run_set.cases[0].absorbers else ())]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
-        pairs = [run_set.records(values) for values in (before, after)]
-    peaks = [_largest_deflections(run_set, records) for records in pairs]
+        pairs = [run_set.records(values) for values in points]
+    peaks = [_largest_deflections(run_set, records) for records in pairs[:2]]
     # Compiled programs must not depend on the names of the runs.
     unnamed = dataclasses.replace(run_set, runs=())
     metrics = [_metrics_of(unnamed, _histories(records, run_set)) for records in pairs]
-    values = [objective.weighted_metrics(found) for found in metrics]
+    values = [float(objective.aggregate(objective.weighted_metrics(found))) for found in metrics]
     metrics_before, metrics_after = (
         {name: float(objective.aggregate(part)) for name, part in found.items()}
-        for found in metrics
+        for found in metrics[:2]
     )
     return RunSetResult(
         name=name,
@@ -292,10 +300,30 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
         saturated_share=np.array(
             [record.saturated.mean() if record.saturated.size else 0.0 for record in pairs[1]]
         ),
-        objective=[float(objective.aggregate(own)) for own in values],
+        objective=values[:2],
         metrics=metrics_after,
         metrics_before=metrics_before,
+        detuned=[values[1], *values[2:]] if values[2:] else [],
     )
+
+
+def _detuned(case: Case, after: dict[str, float], cases: LoadCases, error: float):
+    """The values `after` a tuning, with absorbers of frequencies larger by a relative error.
+
+    Those that differ from run to run are left as they are.
+    """
+    powers, values, sizes = {"frequency": 1, "stiffness": 2}, dict(after), list_sizes(case)
+    varied = {one for run in (*cases.training, *cases.held_out) for one in run}
+    given = {each for one in (*after, *varied) for each in each_address(one, sizes)}
+    for address in after:
+        name = address.rpartition(".")[2]
+        if address.startswith("absorbers.") and name in powers:
+            values[address] *= (1 + error) ** powers[name]
+    for i, one in enumerate(case.absorbers):
+        name = "stiffness" if one.frequency is None else "frequency"
+        if (address := f"absorbers.{i}.{name}") not in given:
+            values[address] = float(concrete(getattr(one, name))) * (1 + error) ** powers[name]
+    return values
 
 
 def _histories(records: list[Record], run_set: RunSet) -> Histories:

@@ -26,6 +26,7 @@ from tuning.control.objective import Objective, with_fixed_design
 from tuning.control.run_set import PLANT_PREFIXES, AddressValues, run_case, value_columns
 from tuning.parameters import FreeParameter
 
+DETUNING = 0.0, -0.05, 0.05  # relative errors of the frequencies of absorbers
 LIMIT_TOLERANCE = 0.01  # fraction of a limit by which it may be exceeded without a remark
 
 
@@ -36,7 +37,8 @@ class RunSetResult:
     Peaks are in m; `least_peaks` are the least achievable ones, NaN if not computed.
     `saturated_share` is the fraction of the time after tuning in which a command is at a limit;
     `objective` has the values before and after; `metrics` are those after tuning, aggregated, and
-    `metrics_before` those before it.
+    `metrics_before` those before it. `detuned` are the objectives after tuning with all absorbers
+    off by the errors DETUNING; empty without absorbers.
     """
 
     name: str
@@ -49,6 +51,7 @@ class RunSetResult:
     objective: list[float]
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
     metrics_before: dict[str, float] = dataclasses.field(default_factory=dict)
+    detuned: list[float] = dataclasses.field(default_factory=list)
 
     def attained_shares(self, peaks: Float[np.ndarray, " run"]) -> Float[np.ndarray, " run"]:
         """Fraction of the attainable reduction that peaks (m) attain, by run."""
@@ -169,6 +172,7 @@ class TuningResult(TableViews):
         for outcome in self.run_sets:
             lines += ["", *_run_table(self.case, outcome)]
         lines += ["", *_metric_table(self.objective, self.run_sets)]
+        lines += _detuned_table(self.run_sets)
         if len(self.start_results) > 1:
             lines += ["", "minima by start:", *_start_lines(self.start_results)]
         if self.rejected_steps:
@@ -201,6 +205,7 @@ class TuningResult(TableViews):
                     },
                     "objective_before": outcome.objective[0],
                     "objective_after": outcome.objective[1],
+                    "objective_detuned": outcome.detuned,
                     "metrics": {
                         name: {"before": outcome.metrics_before.get(name), "after": value}
                         for name, value in outcome.metrics.items()
@@ -265,6 +270,19 @@ def _metric_table(objective: Objective, run_sets: list[RunSetResult]) -> list[st
         f"what was tuned, {words.get(objective.aggregation, tail)}",
         *text_table(header, rows, "<" + ">" * (len(header) - 1)),
     ]
+
+
+def _detuned_table(run_sets: list[RunSetResult]) -> list[str]:
+    """Lines of a table of the objective with absorbers off their frequencies; none without any."""
+    if not run_sets[0].detuned:
+        return []
+    rows = [
+        [f"{error:+.0%}", *(f"{o.detuned[i]:.4g}" for o in run_sets)]
+        for i, error in enumerate(DETUNING)
+    ]
+    header = ["error", *(outcome.name for outcome in run_sets)]
+    title = "objective with all frequencies of absorbers in error, damping ratios or rates kept"
+    return ["", title, *text_table(header, rows, ">" * len(header))]
 
 
 def _run_labels(case: Case, outcome: RunSetResult) -> list[str]:

@@ -343,6 +343,13 @@ def test_absorber_without_controller():
     assert training.peaks_after[0] == pytest.approx(least, rel=5e-3)
     assert held_out.peaks_after[0] < held_out.uncontrolled_peaks[0]
     assert "least" not in str(result)
+    for i, error in enumerate((0.0, -0.05, 0.05)):  # peaks over those without absorber
+        off = (1 + error) * float(result.values[0])
+        for outcome, speed in ((training, 65.0), (held_out, 64.0)):
+            one = jb.replace(case, {"absorbers.0.frequency": off, "loads.0.speed": speed})
+            peak = np.max(np.abs(jb.simulate(one).deflection)) / outcome.uncontrolled_peaks[0]
+            assert outcome.detuned[i] == pytest.approx(float(peak), rel=1e-6)
+    assert any(line.split()[:1] == ["-5%"] for line in str(result).splitlines())
 
 
 # Gradients of metrics of compiled run sets through closed loops, against differences.
