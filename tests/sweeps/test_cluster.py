@@ -257,10 +257,10 @@ import sys
 import jax
 import numpy as np
 import jaxbeam as jb
-from tests.sweeps.test_cluster import CASE, OVER
+from tests.sweeps.test_cluster import CROSSING, OVER_SPEEDS
 assert len(jax.local_devices()) == 3
-peaks = jb.sweep(CASE, OVER, progress=False).peak_deflection.values
-lines = jb.sweep(CASE, OVER, progress=False, histories=True).deflection.values
+peaks = jb.sweep(CROSSING, OVER_SPEEDS, progress=False).peak_deflection.values
+lines = jb.sweep(CROSSING, OVER_SPEEDS, progress=False, histories=True).deflection.values
 np.savez(sys.argv[1], peaks=peaks, lines=lines)
 """
 
