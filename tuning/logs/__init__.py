@@ -1,4 +1,4 @@
-"""Logs of measured runs: files, units, faults, and their match with a case."""
+"""Logs of measured runs: files, units, faults."""
 
 from tuning.logs.alignment import align_logs
 from tuning.logs.quality import find_faults, mask

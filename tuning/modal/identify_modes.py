@@ -27,7 +27,7 @@ from tuning.logs.log import Log
 from tuning.logs.quality import sensor_readings
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import MAX_BAND_RATIO, Candidate, subspace_modes
-from tuning.modal.decay.leaving import impacts_left_out
+from tuning.modal.decay.excitation import impacts_left_out
 from tuning.modal.decay.modes import Decays, find_excited, free_decay_modes, modes_of_decays
 from tuning.modal.forced.measured_responses import (
     Windows,

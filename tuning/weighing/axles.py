@@ -16,8 +16,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.runtime.printer import text_table
+from tuning.fit.dataset import sensor_readings
 from tuning.logs.log import Log
-from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
 from tuning.weighing.influence_lines import InfluenceLines, lines_for
 from tuning.weighing.search import find_axles, most_likely, with_free_frequency

@@ -28,8 +28,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.load_set import load_set
+from tuning.fit.dataset import check_loads, sensor_readings
 from tuning.logs.log import Log
-from tuning.logs.pairing import check_loads, sensor_readings
 from tuning.weighing.axle_fit import DYNAMIC_LIMITS, CrossingLog, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, model_influence_lines
 

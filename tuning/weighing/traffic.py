@@ -25,8 +25,8 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.runtime.progress import ProgressBar
+from tuning.fit.dataset import sensor_readings
 from tuning.logs.log import Log, LogWarning
-from tuning.logs.pairing import sensor_readings
 from tuning.logs.readers.headings import epoch_seconds
 from tuning.logs.reading import read_log, version_of
 from tuning.modal.preprocessing import with_channels

@@ -26,13 +26,12 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.base import AbstractLoad, MovingMass
-from tuning.fit.dataset import WHITENESS_SIGNIFICANCE
+from tuning.fit.dataset import WHITENESS_SIGNIFICANCE, sensor_readings
 from tuning.fit.identify import identify
 from tuning.fit.least_squares import t_quantile
 from tuning.fit.model_validation import ModelCriteria, compare_fits
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
-from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import by_sensor, dynamic_errors, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, UnitForce
 

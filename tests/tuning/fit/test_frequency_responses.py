@@ -14,8 +14,8 @@ from tests.oracles import finite_elements
 from tests.tuning.finite_element_rigs import NOISE, RATE, Plant, patch, plant
 from tests.tuning.fit import test_actuators_from_logs as rigs
 from tuning import Log, ModalFit, identify, identify_from_modes
+from tuning.fit.dataset import pad_cases
 from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
-from tuning.logs.pairing import pad_cases
 from tuning.modal.result import IdentifiedMode
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, MODES = 0.6, 11.68, 0.535, 0.02, 3

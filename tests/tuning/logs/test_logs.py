@@ -17,8 +17,8 @@ from jaxbeam.case.validation import check_case
 from tests.oracles.planted_structures import Structure, random_structure, response
 from tests.tuning.small_rig import rig
 from tuning import Log, ModalSettings, identify_modes, read_log
+from tuning.fit.dataset import case_of_log, check_loads, pad_cases
 from tuning.logs import find_faults, mask
-from tuning.logs.pairing import case_of_log, check_loads, pad_cases
 from tuning.logs.quality import samples_held, sensor_readings, unread
 from tuning.logs.units import UNITS, unit
 from tuning.modal.decay.stretches import excited_samples

@@ -9,7 +9,7 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
 from tuning.modal.decay import modes as decay_modes
-from tuning.modal.decay.leaving import Impact, impacts_left_out, marked_impacts
+from tuning.modal.decay.excitation import Impact, impacts_left_out, marked_impacts
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,

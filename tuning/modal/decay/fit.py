@@ -12,7 +12,7 @@ from scipy.signal import detrend
 from scipy.stats import t as student
 
 from tuning.modal.ambient import Candidate, without_duplicates
-from tuning.modal.decay.leaving import PARTS
+from tuning.modal.decay.excitation import PARTS
 from tuning.modal.decay.poles import (
     FEWER_LEAKAGE_ORDER,
     PoleFit,

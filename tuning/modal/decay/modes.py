@@ -13,6 +13,7 @@ from tuning.modal.ambient import (
     subspace_modes,
     without_duplicates,
 )
+from tuning.modal.decay.excitation import PARTS, free_end, without_excitation
 from tuning.modal.decay.fit import (
     DecayFit,
     decay_candidates,
@@ -20,8 +21,6 @@ from tuning.modal.decay.fit import (
     information_of_modes,
     share_of_modes,
 )
-from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import PARTS, without_excitation
 from tuning.modal.decay.stretches import (
     Stretch,
     after_impact,

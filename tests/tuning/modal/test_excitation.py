@@ -8,9 +8,9 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import random_structure, sampled
 from tuning import identify_modes
 from tuning.modal.ambient import Candidate
-from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import (
+from tuning.modal.decay.excitation import (
     PARTS,
+    free_end,
     growing_fraction,
     has_split,
     undisturbed,
