@@ -35,7 +35,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.control.internal_model import REFERENCE, VALUES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.commands import command_operator
-from tests.case.test_hysteresis import OPERATOR, acting, by_hand
+from tests.case.test_actuators import OPERATOR, acting, by_hand
 from tests.modules import ROOT
 from tests.tuning.fit.test_actuators_from_logs import log_of
 from tuning.control.objective import with_fixed_design

@@ -37,7 +37,7 @@ from tests.oracles.planted_structures import (
     random_structure,
     sampled,
 )
-from tests.tuning.modal.test_subspace import small_structure
+from tests.tuning.modal.test_ambient import small_structure
 
 
 @pytest.mark.parametrize(

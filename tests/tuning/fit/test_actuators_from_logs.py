@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 import tuning
-from tests.case.test_hysteresis import OPERATOR, by_hand
+from tests.case.test_actuators import OPERATOR, by_hand
 from tuning import Log, identify, read_log
 from tuning.fit.hysteresis import fitted_hysteresis
 

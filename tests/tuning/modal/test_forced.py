@@ -6,7 +6,7 @@ from scipy.signal import firwin, lfilter
 
 import tuning
 from tests.oracles.planted_structures import FINER, coloured_noise, response
-from tests.tuning.modal.test_subspace import small_structure
+from tests.tuning.modal.test_ambient import small_structure
 from tuning import Log, ModalSettings, identify_modes
 from tuning.modal.forced.likelihood import refined_poles, triangular_factor
 from tuning.modal.forced.measured_responses import fit_common_denominator, products, transforms
