@@ -45,6 +45,7 @@ from jaxbeam.integrator.step_matrices import (
     step_matrices,
     weights_with_impulses,
     with_impulses,
+    with_prescribed_forces,
 )
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.integrator.vehicles import (
@@ -240,13 +241,16 @@ def step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> Step
     if path.surface is not None:
         by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
         weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
-    vehicle_step = None
-    if loads.wheels.vehicles:
-        vehicle_step = VehicleStep(path.length_index, path.loads, path.pressing, path.surface)
     matrices = step_matrices(discrete, path)
     if path.kinks is not None:
         weight = weights_with_impulses(path.kinks, inertia, weight)
         matrices = with_impulses(path.kinks, matrices, path.rows.shape, discrete.model)
+    matrices, weight, motion = with_prescribed_forces(matrices, inertia, weight)
+    vehicle_step = None
+    if loads.wheels.vehicles:
+        solved = np.s_[:, : path.rows.acceleration.shape[1]]
+        wheels = path.loads[solved], path.pressing[solved]
+        vehicle_step = VehicleStep(path.length_index, *wheels, path.surface, motion)
     return StepInput(matrices, inertia, weight, vehicle_step)
 
 

@@ -5,6 +5,8 @@ sensor. An extrapolation of the forces at the Gauss nodes is the least accurate 
 are the most accurate, of order 12, and so are the forces that the contact law gives for them.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -106,7 +108,8 @@ class LoadPath(Module):
     """Load path in the steps of a chunk: rows at the wheels on the beam, and the surface.
 
     `length_index` is the index of a step's length among those of the grid; start and length are in
-    s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
+    s. `loads` are the indices of the wheels in the rows; `rows` of motion are only those of the
+    first wheels, all others of a step being prescribed. `surface` is the height of the profile (m)
     under all wheels, and its first and second rate, where there is a profile. `influence` is the
     static influence of a force of each wheel at the peak nodes on corrected outputs, `ends` the
     rows of the wheels at the ends of steps; `kinks` mark the steps that are passages over kinks, if
@@ -130,12 +133,16 @@ class LoadPath(Module):
         return self.on_beam if self.kinks is None else self.on_beam & ~self.kinks.here[:, None]
 
 
-def wheels_on_beam(grid: TimeGrid, max_loads: int) -> Int[Array, "panel wheel"]:
+def wheels_on_beam(
+    grid: TimeGrid, max_loads: int, prescribed: Bool[np.ndarray, " wheel"]
+) -> Int[Array, "panel selected"]:
     """Indices of at most `max_loads` wheels in each panel, wheels on the beam first.
 
-    They do not depend on the step, so that compiled programs sort once.
+    Of these, `prescribed` ones are last. They do not depend on the step, so that compiled programs
+    sort once.
     """
-    return xp.argsort(~grid.loads_on_beam, axis=1, stable=True)[:, :max_loads]
+    order = 2 * ~grid.loads_on_beam + prescribed
+    return xp.argsort(order, axis=1, stable=True)[:, :max_loads]
 
 
 @jax.named_scope("load_path")
@@ -151,8 +158,9 @@ def load_path(
     position, speed, acceleration = (xp.moveaxis(p, 0, 1) for p in loads.kinematics(times))
     surface = loads.surface_motion(position, speed, acceleration)
     on_beam = take(grid.loads_on_beam, panel)  # step, load
-    if max_loads < loads.wheel_count:
-        load_index = take(wheels_on_beam(discrete.grid, max_loads), panel)
+    solved = min(max_loads, loads.solved_count)
+    if max_loads < loads.wheel_count or 0 < solved < max_loads:
+        load_index = take(wheels_on_beam(discrete.grid, max_loads, loads.prescribed), panel)
         selection = load_index[:, :, None]
         position, speed, acceleration = (
             xp.take_along_axis(part, selection, axis=1) for part in (position, speed, acceleration)
@@ -161,10 +169,20 @@ def load_path(
     else:
         load_index = xp.broadcast_to(xp.arange(max_loads), on_beam.shape)
     on_beam_at_nodes = xp.broadcast_to(on_beam[:, :, None], position.shape)
-    springs = bool(loads.wheels.vehicles)
     motion = position, speed, acceleration, on_beam_at_nodes
     arms = None if loads.eccentricity is None else take(loads.eccentricity, load_index)[..., None]
-    rows = surface_rows(model, *motion, springs, not loads.massless, arms)
+
+    def rows_of(wheels, springs, inertia):
+        position, speed, acceleration, active = (part[:, wheels] for part in motion)
+        own_arms = None if arms is None else arms[:, wheels]
+        return surface_rows(
+            model, position, speed, acceleration, active, springs, inertia, own_arms
+        )
+
+    rows = rows_of(np.s_[: solved or max_loads], bool(loads.wheels.vehicles), not loads.massless)
+    if 0 < solved < max_loads:
+        shapes = rows.shape, rows_of(np.s_[solved:], False, False).shape
+        rows = dataclasses.replace(rows, shape=xp.concatenate(shapes, axis=1))
     surface = None if surface is None else xp.stack(surface, axis=1)
     influence = ends = None
     if discrete.load_influence is not None:

@@ -75,7 +75,8 @@ def step_maps(step: StepInput, vehicles: Vehicles | None) -> StepMaps:
         of_columns, of_one = contact_maps(step)
         states = 0
     else:
-        of_columns, of_one, of_vehicles = vehicle_maps(vehicles, step)
+        *of_forces, of_vehicles = vehicle_maps(vehicles, step)
+        of_columns, of_one = _with_prescribed_forces(step, *of_forces)
         states = vehicles.loads.vehicle_states
 
     def through_forces(response, *others):
@@ -133,6 +134,8 @@ def contact_maps(step: StepInput):
     shared = share_matrices(inertia)
     if shared:
         inertia, weight = inertia[:, :1], xp.moveaxis(weight, 1, -1)[:, :, 0][:, None]
+    solved = response.shape[1]
+    inertia, weight = inertia[:, :, :solved], weight[:, :, :solved]
     right = [inertia * part[:, None] for part in parts], [weight]
     if is_jax(weight) is any(
         map(is_jax, right[0])
@@ -142,7 +145,17 @@ def contact_maps(step: StepInput):
     of_columns, of_one = xp.concatenate(found[:-1], axis=-1), found[-1]
     if shared:
         of_one = xp.swapaxes(of_one, 1, 3)  # step, batch, wheel, 1
-    return of_columns, of_one
+    return _with_prescribed_forces(step, of_columns, of_one)
+
+
+def _with_prescribed_forces(step: StepInput, of_columns, of_one):
+    """Map to the contact forces of all wheels, from that to those which are solved for."""
+    steps, batch, solved, columns = of_columns.shape
+    weight = xp.swapaxes(step.weight[:, solved:], 1, 2)[..., None]
+    if not weight.shape[2]:
+        return of_columns, of_one
+    none = np.zeros((steps, batch, weight.shape[2], columns))
+    return xp.concatenate([of_columns, none], axis=2), xp.concatenate([of_one, -weight], axis=2)
 
 
 def _forces(compliance, inertia, right: list) -> list:
@@ -168,12 +181,15 @@ def contact_forces(matrices: StepMatrices, inertia, weight, state):
         return -weight
 
     def forces():
-        right = weight + inertia * matvec(matrices.contact_response, state)
-        compliance = matrices.contact_compliance
+        solved, compliance = matrices.contact_response.shape[0], matrices.contact_compliance
+        own = inertia[:solved]
+        right = weight[:solved] + own * matvec(matrices.contact_response, state)
         if isinstance(compliance, ModalCompliance):
             by_run = vmap(lambda m, d: compliance.solve(m[:, None], d[:, None])[:, 0], -1, -1)
-            return by_run(inertia, right)
-        return solve_contact_forces(compliance, inertia, right)
+            found = by_run(own, right)
+        else:
+            found = solve_contact_forces(compliance, own, right)
+        return xp.concatenate([found, -weight[solved:]])
 
     # Without loads on the beam there is nothing to solve, which halves the cost of such steps.
     return cond(matrices.loaded, forces, lambda: xp.zeros_like(weight))

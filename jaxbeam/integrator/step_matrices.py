@@ -17,6 +17,7 @@ acceleration of the surface under a wheel, and S S' that of the compliance. So a
 of no length with matrices of its own, and impulses are its contact forces at its first node.
 """
 
+import dataclasses
 import math
 import operator
 from typing import Any
@@ -34,6 +35,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
     Module,
+    add_at,
     any_jax,
     cond,
     is_jax,
@@ -56,7 +58,7 @@ NUMPY_CHUNK_ENTRIES = 2**19  # entries of matrices that NumPy computes together,
 class CommandMatrices(Module):
     """Maps of commands at the nodes to the acceleration under the loads and the final state."""
 
-    contact_response: Float[Array, "step row command"] | None
+    contact_response: Float[Array, "step solved_row command"] | None
     input_matrix: Float[Array, "step state command"]
 
 
@@ -74,23 +76,24 @@ class SpringMatrices(Module):
     The motion is the deflection, then the velocity, of the surface.
     """
 
-    response: Float[Array, "step motion row state"]
-    compliance: Float[Array, "step motion row row"]
-    commands: Float[Array, "step motion row command"] | None
+    response: Float[Array, "step motion solved_row state"]
+    compliance: Float[Array, "step motion solved_row force"]
+    commands: Float[Array, "step motion solved_row command"] | None
 
 
 class StepMatrices(Module):
     """Matrices of the steps of a chunk; rows are (load, node), commands (node, actuator).
 
     `contact_response` maps the state at the start to the acceleration under the loads at the
-    nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
+    nodes, `contact_compliance` the contact forces; both are None where no load has inertia. Their
+    rows are those of the first loads, the forces of all others being prescribed.
     `springs` are None where no wheel has springs. The columns of `monitored` are state at the
     start, contact forces at the nodes, contact forces at the ends if outputs respond to them
     directly, and commands. A step is `loaded` with a load on the beam.
     """
 
-    contact_response: Float[Array, "step row state"] | None
-    contact_compliance: Float[Array, "step row row"] | ModalCompliance | None
+    contact_response: Float[Array, "step solved_row state"] | None
+    contact_compliance: Float[Array, "step solved_row force"] | ModalCompliance | None
     transition: Float[Array, "step block side side"]
     force_response: Float[Array, "step state row"]
     monitored: Float[Array, "step sample input"] | None
@@ -131,9 +134,11 @@ def chunk_length(
         return CHUNK_STEPS
     rows = max_loads * NODE_COUNT
     states = discrete.model.state_count + loads.vehicle_states
-    if loads.wheels.vehicles:
-        rows = loads.wheel_count * NODE_COUNT
-    compliance = rows * min(rows, NODE_COUNT * discrete.model.mode_count)
+    solved = min(max_loads, loads.solved_count) * NODE_COUNT
+    compliance = solved * min(rows, NODE_COUNT * discrete.model.mode_count)
+    if loads.wheels.vehicles:  # springs feel deflection and velocity, and those of a vehicle all
+        sprung = int(loads.on_ground.sum() + 1) * NODE_COUNT
+        compliance = max(2 * solved * rows, sprung**2)
     transition = states**2
     plain = discrete.modal_command_matrix is None and not loads.wheels.vehicles
     if plain and advances_by_forces(states):
@@ -148,9 +153,7 @@ def chunk_length(
         monitored = discrete.monitored_transition.shape[1] * (states + rows)
     entries = max(of_matrices, batch * (rows + states), monitored)
     if prepared:
-        # Compliances of springs, of deflection and velocity, have no factors.
-        largest = max(entries, 2 * rows**2 if loads.wheels.vehicles else 0)
-        return prepared if prepared * largest <= PREPARED_ENTRIES else CHUNK_STEPS
+        return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
     if any_jax(loads):
         return CHUNK_STEPS
     return int(max(1, min(discrete.grid.step_count, NUMPY_CHUNK_ENTRIES // entries)))
@@ -260,11 +263,12 @@ def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows
     of_states, deflection_transition, deflection_force_response = propagators
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
+    solved = 0 if rows is None else rows.shape[1] * nodes
     states = discrete.model.state_count
     contact_response = contact_compliance = None
     if rows is not None:
         contact_response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
-        contact_response = contact_response.reshape(steps, size, states)
+        contact_response = contact_response.reshape(steps, solved, states)
         contact_compliance = _contact_compliance(
             of_states.input_nodes[..., :modes], shape, rows, motion.deflection is None, t
         )
@@ -307,7 +311,7 @@ def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows
             None
             if rows is None
             else _command_response(discrete, command_responses, shape, rows, t).reshape(
-                steps, size, command_count
+                steps, solved, command_count
             ),
             for_all_steps(
                 xp.moveaxis(of_states.input_end[..., 0, :, modes:], -2, -3), states, command_count
@@ -334,7 +338,7 @@ def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> Spri
     Rows are those to the deflection under all wheels, then to the velocity.
     """
     steps, load_count, nodes, _, modes = shape.shape
-    size = load_count * nodes
+    solved = rows.shape[1] // 2 * nodes
     response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
     by_force = xp.einsum(f"tpcbi,{t}cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes])
     compliance = xp.einsum("tpcfbm,tqfbm->tpcqf", by_force, shape)
@@ -343,11 +347,11 @@ def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> Spri
         by_command = of_states.input_nodes[..., 0, :, modes:]
         commands = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], by_command)
         count = math.prod(commands.shape[3:])
-        commands = commands.reshape(steps, 2, size, count)
+        commands = commands.reshape(steps, 2, solved, count)
     states = discrete.model.state_count
     return SpringMatrices(
-        response.reshape(steps, 2, size, states),
-        compliance.reshape(steps, 2, size, size),
+        response.reshape(steps, 2, solved, states),
+        compliance.reshape(steps, 2, solved, load_count * nodes),
         commands,
     )
 
@@ -359,23 +363,25 @@ def _contact_compliance(input_nodes, shape, rows, by_factors, t):
     forces.
     """
     steps, load_count, nodes, blocks, modes = shape.shape
-    size = load_count * nodes
+    solved, size = rows.shape[1], load_count * nodes
+    own_shape = shape[:, :solved]
     response = xp.einsum(f"tpcbi,{t}cfbim->tpcfbm", rows, input_nodes)
-    if by_factors and load_count > blocks * modes:
+    if by_factors and solved > blocks * modes:
         own_node = np.eye(nodes)[:, :, None, None]
-        response = response + shape[:, :, :, None] * own_node
+        response = response + own_shape[:, :, :, None] * own_node
         shape_rows = shape.reshape(steps, load_count, nodes, -1)
-        return ModalCompliance(response.reshape(steps, size, -1), shape_rows)
+        return ModalCompliance(response.reshape(steps, solved * nodes, -1), shape_rows)
     compliance = xp.einsum("tpcfbm,tqfbm->tpcqf", response, shape)
-    direct = xp.einsum("tpcbm,tqcbm->tpcq", shape, shape)
+    direct = xp.einsum("tpcbm,tqcbm->tpcq", own_shape, shape)
     compliance = compliance + direct[..., None] * np.eye(nodes)[:, None, :]
-    return compliance.reshape(steps, size, size)
+    return compliance.reshape(steps, solved * nodes, size)
 
 
 def _command_response(discrete: DiscreteModel, command_responses, shape, rows, t):
     """Acceleration (m/s^2) under the loads at the nodes due to unit commands at the nodes."""
     response = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], command_responses)
-    feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
+    own_shape = shape[:, : rows.shape[1], :, 0]
+    feedthrough = xp.einsum("tpcm,mu->tpcu", own_shape, discrete.modal_command_matrix)
     return response + feedthrough[:, :, :, None] * np.eye(shape.shape[2])[:, :, None]
 
 
@@ -391,6 +397,32 @@ def weights_with_impulses(
     return _in_passages(kinks, inertia * jumps, weight)
 
 
+def with_prescribed_forces(
+    matrices: StepMatrices,
+    inertia: Float[Array, "step row batch"],
+    weight: Float[Array, "step row batch"],
+):
+    """Matrices of the solved rows alone, weights, and motion (m, m/s) of the surface, or None.
+
+    The forces of the other rows are prescribed. They accelerate the surface under the solved
+    wheels, as a profile does, and move it under those with springs.
+    """
+    solved = 0 if matrices.contact_response is None else matrices.contact_response.shape[1]
+    if not solved or solved == weight.shape[1]:
+        return matrices, weight, None
+    forces = -set_at(weight, np.s_[:, :solved], 0.0)
+    compliance: Any = matrices.contact_compliance
+    weight = add_at(weight, np.s_[:, :solved], inertia[:, :solved] * (compliance @ forces))
+    motion, springs = None, matrices.springs
+    if springs is not None:
+        motion = springs.compliance @ forces[:, None]
+        springs = dataclasses.replace(springs, compliance=springs.compliance[..., :solved])
+    if not isinstance(compliance, ModalCompliance):
+        compliance = compliance[..., :solved]
+    kept = dataclasses.replace(matrices, contact_compliance=compliance, springs=springs)
+    return kept, weight, motion
+
+
 def with_impulses(
     kinks: KinkSteps,
     matrices: StepMatrices,
@@ -403,23 +435,25 @@ def with_impulses(
     """
     steps, loads, nodes = shape.shape[:3]
     shapes = shape[:, :, 0].reshape(steps, loads, -1)
+    solved = matrices.contact_response.shape[1] // nodes
+    own_shapes = shapes[:, :solved]
 
     def at_first_node(like, axes: tuple[int, ...], index, values):
         """`like` with values at an index in passages; rows along `axes` are (wheel, node)."""
         size: list[Any] = list(like.shape)
         for axis in sorted(axes, reverse=True):
-            size[axis : axis + 1] = loads, nodes
+            size[axis : axis + 1] = size[axis] // nodes, nodes
         return _in_passages(kinks, set_at(xp.zeros(size), index, values).reshape(like.shape), like)
 
     index = np.s_[:, :, 0, model.coordinate_index]
-    response = at_first_node(matrices.contact_response, (1,), index, kinks.slopes)
+    response = at_first_node(matrices.contact_response, (1,), index, kinks.slopes[:, :solved])
     compliance: Any = matrices.contact_compliance
     if isinstance(compliance, ModalCompliance):
         index = np.s_[:, :, 0, : shapes.shape[2]]
-        factor = at_first_node(compliance.response, (1,), index, shapes)
+        factor = at_first_node(compliance.response, (1,), index, own_shapes)
         compliance = ModalCompliance(factor, compliance.shape_rows)
     else:
-        mobility = shapes @ xp.swapaxes(shapes, 1, 2)
+        mobility = own_shapes @ xp.swapaxes(shapes, 1, 2)
         compliance = at_first_node(compliance, (1, 2), np.s_[:, :, 0, :, 0], mobility)
     index = np.s_[:, model.rate_index, :, 0]
     forces = at_first_node(matrices.force_response, (2,), index, xp.swapaxes(shapes, 1, 2))

@@ -147,19 +147,21 @@ class VehicleStep(Module):
 
     `length_index` is that of the step's length; `wheels` are the indices of the wheels of the rows,
     and whether they are `on_beam`; `surface` is the motion of the profile under all wheels (see
-    `LoadPath`).
+    `LoadPath`), `motion` that of the surface under prescribed forces at the rows, None without any.
     """
 
     length_index: Int[Array, " *step"]
     wheels: Int[Array, "*step wheel"]
     on_beam: Bool[Array, "*step wheel"]
     surface: Float[Array, "*step 3 all node"] | None
+    motion: Float[Array, "*step 2 row batch"] | None = None
 
 
 class StepInput(Module):
     """Inputs of the steps of a batch: matrices, and inertia (kg) and weight (N) of the rows.
 
-    The weight includes the inertia forces of the profile. Without vehicles, `vehicles` is None.
+    The weight includes the inertia forces of profile and prescribed forces. Without vehicles,
+    `vehicles` is None.
     """
 
     matrices: StepMatrices
@@ -184,14 +186,17 @@ def vehicles_of(loads: LoadSet, lengths: Float[Array, " length"]) -> Vehicles | 
 
 
 def vehicle_maps(vehicles: Vehicles, step: StepInput):
-    """Affine maps to the contact forces (linear part, offset), and to the states of the vehicles.
+    """Affine maps to the solved forces (linear part, offset), and to the states of the vehicles.
 
     All are (step, batch, row, column); columns are states of the beam, of the vehicles, and
     commands. The map to the states is a pair of linear part and offset.
     """
     matrices, loads, wheels = step.matrices, vehicles.loads, vehicles.loads.wheels
     steps, batch = step.inertia.shape[0], step.inertia.shape[-1]
-    inertia, weight = (xp.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight))
+    rows = matrices.contact_response.shape[1]
+    inertia, weight = (
+        xp.swapaxes(part[:, :rows], 1, 2)[..., None] for part in (step.inertia, step.weight)
+    )
     at_rows = (take(part, step.vehicles.wheels) for part in (wheels.stiffness, wheels.damping))
     stiffness, damping = (
         xp.swapaxes(xp.repeat(part, NODE_COUNT, axis=1), 1, 2)[..., None] for part in at_rows
@@ -201,7 +206,6 @@ def vehicle_maps(vehicles: Vehicles, step: StepInput):
         return stiffness * parts[:, 0, None] + damping * parts[:, 1, None]
 
     springs, commands = matrices.springs, matrices.commands
-    rows = matrices.contact_response.shape[1]
     no_vehicles = np.zeros((steps, batch, rows, loads.vehicle_states))
     surface = [on_springs(springs.response), no_vehicles]
     by_commands = no_vehicles[..., :0]
@@ -209,14 +213,17 @@ def vehicle_maps(vehicles: Vehicles, step: StepInput):
         surface.append(on_springs(springs.commands))
         by_commands = inertia * commands.contact_response[:, None]
     coupling, by_states, by_profile = springs_of_wheels(vehicles, step.vehicles, batch)
-    surface = xp.concatenate(surface, axis=-1)
+    prescribed = xp.zeros((steps, batch, rows, 1))
+    if step.vehicles.motion is not None:
+        moved = xp.moveaxis(step.vehicles.motion, 3, 1)[..., None]  # step, batch, motion, row, 1
+        prescribed = stiffness * moved[:, :, 0] + damping * moved[:, :, 1]
+    surface = xp.concatenate([*surface, prescribed], axis=-1)
     by_beam = inertia * matrices.contact_response[:, None]
-    right = xp.concatenate([by_beam, -by_states, by_commands], axis=-1) + coupling @ surface
-    right = xp.concatenate([right, weight + by_profile], axis=-1)
+    right = xp.concatenate([by_beam, -by_states, by_commands, weight + by_profile], axis=-1)
+    right = right + coupling @ surface
     impedance = on_springs(springs.compliance)
     system = np.eye(rows) + inertia * matrices.contact_compliance[:, None]
     forces = -solve_conditioned(system + coupling @ impedance, right)
-    surface = xp.concatenate([surface, np.zeros((*surface.shape[:-1], 1))], axis=-1)
     of_vehicles = _state_maps(vehicles, step, surface + impedance @ forces)
     of_vehicles = of_vehicles[..., :-1], of_vehicles[..., -1:]
     return forces[..., :-1], forces[..., -1:], of_vehicles
@@ -224,11 +231,11 @@ def vehicle_maps(vehicles: Vehicles, step: StepInput):
 
 def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
     """Matrices S and O at the rows of the steps, and S q of the profile (step, batch, row, ...)."""
-    loads, wheels, length = vehicles.loads, step.wheels, step.length_index
+    loads, length, (index, count) = vehicles.loads, step.length_index, _sprung(vehicles.loads)
     on_beam = xp.repeat(step.on_beam, NODE_COUNT, axis=1)[:, None, :, None]
-    profile = _profile(vehicles, step, batch)
+    profile, wheels = _profile(vehicles, step, batch), take(index, step.wheels)
     rows = (wheels[..., None] * NODE_COUNT + np.arange(NODE_COUNT)).reshape(len(wheels), -1)
-    all_rows = loads.wheel_count * NODE_COUNT
+    all_rows = (count + 1) * NODE_COUNT
     shape = len(length), profile.shape[1], all_rows
     coupling_blocks, state_blocks, first = [], [], 0
     for group, part in zip(loads.wheels.vehicles, vehicles.propagators, strict=True):
@@ -238,7 +245,7 @@ def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
         )
         states = of_states.shape[-1]
         for i in range(group.count):
-            own = _rows_of(group, i)
+            own = _rows_of(group, i, index)
             coupling_blocks.append((np.s_[..., own, own], of_surface))
             state_blocks.append((np.s_[..., own, first : first + states], of_states))
             first += states
@@ -260,14 +267,16 @@ def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
 
 
 def _profile(vehicles: Vehicles, step: VehicleStep, batch: int) -> Float[Array, "step batch row 1"]:
-    """Spring forces q = k y + c y' (N) of the profile at all wheels and nodes of the steps."""
-    wheels = vehicles.loads.wheels
-    shape = len(step.wheels), batch, vehicles.loads.wheel_count * NODE_COUNT, 1
+    """Spring forces q = k y + c y' (N) of the profile at the rows of `_sprung` wheels."""
+    wheels, sprung = vehicles.loads.wheels, vehicles.loads.on_ground
+    shape = len(step.wheels), batch, (int(sprung.sum()) + 1) * NODE_COUNT, 1
     if step.surface is None:
         return xp.zeros(shape)
-    height, rate, _ = xp.moveaxis(step.surface, 1, 0)[:, :, None]
-    stiffness, damping = (part.T[..., None] for part in (wheels.stiffness, wheels.damping))
-    return (stiffness * height + damping * rate).reshape(shape)
+    height, rate, _ = xp.moveaxis(step.surface[:, :, sprung], 1, 0)[:, :, None]
+    springs = wheels.stiffness, wheels.damping
+    stiffness, damping = (part[sprung].T[..., None] for part in springs)
+    pressed = stiffness * height + damping * rate
+    return xp.pad(pressed, [(0, 0), (0, 0), (0, 1), (0, 0)]).reshape(shape)
 
 
 def _state_maps(vehicles: Vehicles, step: StepInput, surface):
@@ -275,14 +284,18 @@ def _state_maps(vehicles: Vehicles, step: StepInput, surface):
 
     `surface` is the map to q = k y + c y' of the beam at the rows.
     """
-    loads, wheels, length = vehicles.loads, step.vehicles.wheels, step.vehicles.length_index
+    loads, length, (index, count) = (
+        vehicles.loads,
+        step.vehicles.length_index,
+        _sprung(vehicles.loads),
+    )
     (steps, batch, _, columns), states = surface.shape, step.matrices.state_count
     parts = surface.reshape(steps, batch, -1, NODE_COUNT, columns)
     parts = parts * step.vehicles.on_beam[:, None, :, None, None]
     step_index, batch_index = np.ogrid[:steps, :batch]
     by_wheel = set_at(
-        np.zeros((steps, batch, loads.wheel_count, NODE_COUNT, columns)),
-        (step_index[..., None], batch_index[..., None], wheels[:, None]),
+        np.zeros((steps, batch, count + 1, NODE_COUNT, columns)),
+        (step_index[..., None], batch_index[..., None], take(index, step.vehicles.wheels)[:, None]),
         parts,
     )
     by_row = by_wheel.reshape(steps, batch, -1, columns)
@@ -295,16 +308,26 @@ def _state_maps(vehicles: Vehicles, step: StepInput, surface):
         )
         for i in range(group.count):
             own = slice(first, first + transition.shape[-1])
-            next_state = to_end @ by_row[..., _rows_of(group, i), :]
+            next_state = to_end @ by_row[..., _rows_of(group, i, index), :]
             maps.append(add_at(next_state, np.s_[..., own], transition))
             first = own.stop
     return xp.concatenate(maps, axis=2)
 
 
-def _rows_of(group: VehicleGroup, vehicle: int) -> slice:
-    """Slice of the rows (wheel, node) of a vehicle of a load among the rows of all wheels."""
+def _sprung(loads: LoadSet) -> tuple[Int[np.ndarray, " wheel"], int]:
+    """Index of each wheel among those with springs, and their number: the index of all others.
+
+    Of rows of the former there is one wheel more, whose are zero or without meaning.
+    """
+    sprung = loads.on_ground
+    count = int(sprung.sum())
+    return np.where(sprung, np.cumsum(sprung) - 1, count), count
+
+
+def _rows_of(group: VehicleGroup, vehicle: int, index: Int[np.ndarray, " wheel"]) -> slice:
+    """Slice of the rows (wheel, node) of a vehicle of a load among those of wheels with springs."""
     rows = group.wheels_per_vehicle * NODE_COUNT
-    start = group.first_wheel * NODE_COUNT + vehicle * rows
+    start = int(index[group.first_wheel]) * NODE_COUNT + vehicle * rows
     return slice(start, start + rows)
 
 

@@ -66,13 +66,13 @@ class SurfaceRows(Module):
 
     `shape` is that of the modes; `acceleration`, `velocity` and `deflection` act on the states in
     the blocks of the modal model. The first is None where no wheel has inertia, the others where
-    none has springs.
+    none has springs. In steps of a run they are those of the first wheels, which are solved for.
     """
 
     shape: Float[Array, "*wheel block mode"]
-    acceleration: Float[Array, "*wheel block side"] | None
-    velocity: Float[Array, "*wheel block side"] | None
-    deflection: Float[Array, "*wheel block side"] | None
+    acceleration: Float[Array, "*solved block side"] | None
+    velocity: Float[Array, "*solved block side"] | None
+    deflection: Float[Array, "*solved block side"] | None
 
 
 def surface_rows(
@@ -269,20 +269,27 @@ class ModalCompliance(Module):
     """Compliance G = U V' of contact forces that act through fewer modes than there are loads.
 
     `response` U maps generalised forces at the Gauss nodes (node and mode) to the acceleration
-    under the loads (load and node). V' maps contact forces to generalised forces, with the mode
-    shapes at the loads, `shape_rows`.
+    under the loads (load and node), of which the first are solved for. V' maps contact forces to
+    generalised forces, with the mode shapes at all loads, `shape_rows`.
     """
 
-    response: Float[Array, "*step row node_mode"]
+    response: Float[Array, "*step solved_row node_mode"]
     shape_rows: Float[Array, "*step load node mode"]
+
+    def __matmul__(
+        self, forces: Float[Array, "*batch row column"]
+    ) -> Float[Array, "*batch solved_row column"]:
+        """Accelerations G f (m/s^2) under the solved loads."""
+        return self.response @ self.generalised_forces(forces)
 
     def generalised_forces(
         self, forces: Float[Array, "*batch row column"]
     ) -> Float[Array, "*batch node_mode column"]:
-        """Generalised forces V' f of contact forces."""
-        *_, loads, nodes, modes = self.shape_rows.shape
-        forces = forces.reshape(*forces.shape[:-2], loads, nodes, -1)
-        by_node = xp.moveaxis(self.shape_rows, -3, -1) @ xp.moveaxis(forces, -3, -2)
+        """Generalised forces V' f of contact forces of the first loads."""
+        *_, nodes, modes = self.shape_rows.shape
+        forces = forces.reshape(*forces.shape[:-2], forces.shape[-2] // nodes, nodes, -1)
+        shape_rows = self.shape_rows[..., : forces.shape[-3], :, :]
+        by_node = xp.moveaxis(shape_rows, -3, -1) @ xp.moveaxis(forces, -3, -2)
         return by_node.reshape(*by_node.shape[:-3], nodes * modes, -1)
 
     def solve(

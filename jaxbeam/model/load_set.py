@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import (
     AbstractLoad,
     ForceHistory,
@@ -21,7 +20,7 @@ from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractTrajectory, has_come
 from jaxbeam.model.elements import Layout
 from jaxbeam.model.transfer_matrices import surface
-from jaxbeam.runtime.arrays import Array, Module, add_at, is_jax, is_numpy, xp
+from jaxbeam.runtime.arrays import Array, Module, add_at, is_numpy, xp
 
 
 class VehicleGroup(Module):
@@ -90,11 +89,13 @@ class WheelSet(Module):
 
     Inertia (kg) and weight (N, the static load), contact stiffness (N/m) and damping (N s/m) of the
     springs between surface and vehicle, and the vehicles. Without vehicles there are no springs.
-    `histories` are forces over time in addition to the weight, by the index of their wheel.
+    `histories` are forces over time in addition to the weight, by the index of their wheel. The
+    force of a wheel is `prescribed` if it certainly has neither inertia nor a spring.
     """
 
     inertia: Float[Array, "wheel batch"]
     weight: Float[Array, "wheel batch"]
+    prescribed: tuple[bool, ...] = eqx.field(static=True)
     stiffness: Float[Array, "wheel batch"] | None = None
     damping: Float[Array, "wheel batch"] | None = None
     vehicles: tuple[VehicleGroup, ...] = ()
@@ -103,7 +104,7 @@ class WheelSet(Module):
     @property
     def massless(self) -> bool:
         """Whether all wheels certainly have no inertia or springs: forces are weights."""
-        return not self.vehicles and is_numpy(self.inertia) and not np.any(self.inertia)
+        return all(self.prescribed)
 
     def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
         """Wheels and vehicles of similar loads, with all masses, springs and dampers in proportion.
@@ -118,7 +119,14 @@ class WheelSet(Module):
             part if part is None else part * factor for part in (self.stiffness, self.damping)
         )
         inertia, weight = self.inertia * factor, self.weight * factor
-        return WheelSet(inertia, weight, stiffness, damping, groups, self.histories)
+        return dataclasses.replace(
+            self,
+            inertia=inertia,
+            weight=weight,
+            stiffness=stiffness,
+            damping=damping,
+            vehicles=groups,
+        )
 
 
 class LoadSet(Module):
@@ -168,10 +176,12 @@ class LoadSet(Module):
     @property
     def prescribed(self) -> Bool[np.ndarray, " wheel"]:
         """Whether the force of each wheel is given: neither mass nor spring can change it."""
-        inertia = self.wheels.inertia
-        if is_jax(inertia) and not is_concrete(inertia):
-            return np.zeros(self.wheel_count, bool)
-        return ~np.any(concrete(inertia), axis=1) & ~self.on_ground
+        return np.array(self.wheels.prescribed, bool)
+
+    @property
+    def solved_count(self) -> int:
+        """Number of wheels whose forces are solved for."""
+        return self.wheels.prescribed.count(False)
 
     @property
     def load_of_wheel(self) -> list[int]:
@@ -344,18 +354,21 @@ def _wheels(loads: Sequence[AbstractLoad | Absorber], vehicles: Sequence[Vehicle
         parts = [xp.tile(getattr(v, name), n) for v, n in zip(vehicles, counts, strict=True)]
         return (xp.concatenate(parts) if parts else xp.zeros(0))[:, None]
 
-    groups, histories, first_wheel = [], {}, 0
+    groups, histories, prescribed, first_wheel = [], {}, [], 0
     for load, vehicle, count in zip(loads, vehicles, counts, strict=True):
         for wheel, history in load.force_histories().items():
             histories[first_wheel + wheel] = jax.tree.map(lambda part: part[..., None], history)
+        masses = vehicle.wheel_masses
+        massless = masses == 0 if is_numpy(masses) else np.zeros(masses.shape, bool)
+        prescribed += (massless & (not vehicle.names)).tolist() * count
         if vehicle.names:
             groups.append(_vehicle_group(vehicle, first_wheel, count))
         first_wheel += count * vehicle.offsets.shape[0]
     inertia, weight = of_all_wheels("wheel_masses"), of_all_wheels("static_loads")
     if not groups:
-        return WheelSet(inertia, weight, histories=histories)
+        return WheelSet(inertia, weight, tuple(prescribed), histories=histories)
     springs = of_all_wheels("contact_stiffness"), of_all_wheels("contact_damping")
-    return WheelSet(inertia, weight, *springs, tuple(groups), histories)
+    return WheelSet(inertia, weight, tuple(prescribed), *springs, tuple(groups), histories)
 
 
 def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> VehicleGroup:

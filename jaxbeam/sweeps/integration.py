@@ -100,15 +100,9 @@ class Program(NamedTuple):
         def wheels_of_run(values):
             pairs = dict(zip(self.batched_addresses, values, strict=True))
             pairs.pop(PROFILE_NUMBER, None)  # changes no wheel
-            wheels = wheel_set(replace(varied, pairs))
-            if wheels.massless:  # no contact equations; `vmap` would hide that the inertia is zero
-                wheels = eqx.tree_at(_inertia, wheels, None)
-            return jax.tree.map(lambda part: part[..., 0], wheels)
+            return jax.tree.map(lambda part: part[..., 0], wheel_set(replace(varied, pairs)))
 
         wheels = vmap(wheels_of_run, out_axes=-1)(batched_values)
-        if wheels.inertia is None:
-            massless = np.zeros(wheels.weight.shape)
-            wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
         return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
 
     def grid(self, model, shared_values, stepping: Stepping):
@@ -299,10 +293,6 @@ def _map_masked(function, mask, values):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     return jax.lax.map(lambda row: jax.lax.cond(row[0], function, zeros, row[1]), (mask, values))
-
-
-def _inertia(wheels):
-    return wheels.inertia
 
 
 def _split_shared_model(models: ModalModel):

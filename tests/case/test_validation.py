@@ -556,10 +556,10 @@ def test_cubics_of_a_load_set_are_padded_to_the_same_number():
         TabulatedTrajectory(jnp.asarray(TIMES), jnp.asarray(POSITIONS), LENGTH),
     )
     zeros = jnp.zeros((2, 1))
-    wheels = WheelSet(zeros, zeros)
+    wheels = WheelSet(zeros, zeros, (False, False))
     breakpoints, cubics = LoadSet(trajectories, wheels, (np.zeros(1),) * 2).cubics()
     assert breakpoints.shape == (2, 5) and cubics.shape == (2, 5, 4)
     assert_allclose(breakpoints[0], [0.2, 2.2, np.inf, np.inf, np.inf])
     assert_allclose(cubics[1], trajectories[1].cubics()[1])
-    none = LoadSet((), WheelSet(zeros[:0], zeros[:0]), ()).cubics()
+    none = LoadSet((), WheelSet(zeros[:0], zeros[:0], ()), ()).cubics()
     assert [part.shape for part in none] == [(0, 1), (0, 1, 4)]

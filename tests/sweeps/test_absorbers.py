@@ -12,7 +12,7 @@ from jaxbeam.cli.commands.sweep import _absorber_lines
 from jaxbeam.files.tables import sweep_columns
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps.computation import StrokeWarning
-from tests.simulation.test_absorbers import BRIDGE, first_principles
+from tests.simulation.test_absorbers import BRIDGE, ROW_AND_MASS, first_principles
 
 PEAKS = "peak_stroke", "peak_absorber_force"
 ABSORBERS = [
@@ -69,9 +69,9 @@ def test_strokes_against_scipy(monkeypatch, engine):
         )
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(9))
 def test_peaks_are_those_of_single_runs(monkeypatch, seed):
-    """Random absorbers under a mass or an oscillator, on a level road or a rough one."""
+    """Random absorbers under a mass, an oscillator or a row, on a level road or a rough one."""
     random = np.random.default_rng(seed)
     absorbers = [
         jb.Absorber(
@@ -84,11 +84,12 @@ def test_peaks_are_those_of_single_runs(monkeypatch, seed):
         )
         for _ in range(random.integers(1, 4))
     ]
-    load = (
-        jb.MovingMass(mass=6e3, speed=35.0)
-        if seed % 2
-        else jb.Oscillator(mass=9e3, stiffness=2e6, damping=3e4, speed=35.0)
-    )
+    if seed == 8:
+        load = ROW_AND_MASS[0]
+    elif seed % 2:
+        load = jb.MovingMass(mass=6e3, speed=35.0)
+    else:
+        load = jb.Oscillator(mass=9e3, stiffness=2e6, damping=3e4, speed=35.0)
     road = jb.profiles.SineProfile(amplitude=1e-3, wavelength=6.0) if seed % 4 < 2 else None
     case = case_under(load, absorbers, profile=road)
     axes = {"loads.0.speed": [35.0, 28.0], "absorbers.0.damping_ratio": [0.05, 0.1]}

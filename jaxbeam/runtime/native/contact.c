@@ -92,8 +92,8 @@ static inline Register force_at(const Workspace *w, const Step *step, const Grou
 /* Contact forces at the Gauss nodes of a step, for a number of loads that may be known when
  * compiling. */
 static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *step,
-                                                const Group *g, int loads, Register *matrix,
-                                                Register *forces) {
+                                                const Group *g, int loads, int prescribed,
+                                                Register *matrix, Register *forces) {
     const int rows = loads * NODES;
     memset(forces, 0, (size_t)rows * sizeof *forces);
     add_product(forces, step->contact_response[ACCELERATION], rows, g->state, w->states);
@@ -106,24 +106,26 @@ static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *
             const int i = s * NODES + k;
             if (w->has_surface)
                 forces[i] += profile_motion(w, step, g, wheel, HEIGHT_SECOND_RATE, k);
-            forces[i] = -(weight + mass * forces[i]);
+            forces[i] = s < prescribed ? -weight : -(weight + mass * forces[i]);
             if (w->has_forces) forces[i] -= force_at(w, step, g, wheel, k);
+            if (s < prescribed) continue;
             for (int j = 0; j < rows; j++)
                 matrix[i * rows + j] = mass * step->contact_compliance[ACCELERATION][i * rows + j];
             matrix[i * rows + i] += 1;
         }
     }
-    if (w->groups_of_vehicles) add_vehicles(w, step, g, loads, matrix, forces);
-    solve_contact_system(matrix, forces, rows);
+    if (w->groups_of_vehicles) add_vehicles(w, step, g, loads, prescribed, matrix, forces);
+    solve_contact_system(matrix, forces, rows, prescribed * NODES);
 }
 
 void solve_contact(const Workspace *w, const Step *step, const Group *g) {
-    if (step->loads == 1) { /* the matrix fits into registers */
+    if (step->loads == 1 && !step->prescribed) { /* the matrix fits into registers */
         Register matrix[NODES * NODES], forces[NODES];
-        contact_forces(w, step, g, 1, matrix, forces);
+        contact_forces(w, step, g, 1, 0, matrix, forces);
         memcpy(g->state + w->states, forces, sizeof forces);
     } else {
-        contact_forces(w, step, g, step->loads, g->matrix, g->state + w->states);
+        Register *forces = g->state + w->states;
+        contact_forces(w, step, g, step->loads, step->prescribed, g->matrix, forces);
     }
 }
 
@@ -155,7 +157,7 @@ void end_forces(const Workspace *w, const Step *step, const Group *g) {
                         mass * step->end_compliance[(end * loads + s) * loads + q];
                 matrix[s * loads + s] += 1;
             }
-            solve_contact_system(matrix, right, loads);
+            solve_contact_system(matrix, right, loads, 0);
         }
         for (int s = 0; s < loads; s++) found[2 * s + end] = right[s];
     }

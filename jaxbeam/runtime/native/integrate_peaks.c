@@ -53,12 +53,30 @@ static int next_chunk(Workspace *w, int *panel, int64_t *done, int64_t before) {
         step->loads = 0;
         const uint8_t *active = (const uint8_t *)w->inputs[LOADS_ON_BEAM] + *panel * w->loads;
         const int loads = w->peaks_final ? 0 : w->loads; /* all have left, but for rounding */
-        for (int l = 0; l < loads && step->loads < w->max_loads; l++)
-            if (active[l]) step->load_numbers[step->loads++] = l;
+        for (int prescribed = 1; prescribed >= 0; prescribed--) {
+            for (int l = 0; l < loads && step->loads < w->max_loads; l++)
+                if (active[l] && w->prescribed[l] == prescribed)
+                    step->load_numbers[step->loads++] = l;
+            if (prescribed) step->prescribed = step->loads;
+        }
         step->rows = step->loads * NODES, step->ends = w->influence_terms ? 2 * step->loads : 0;
         if (!w->peaks_final) prepare_step(w, step);
     }
     return count;
+}
+
+/* Whether the force of each wheel is prescribed in all runs. */
+static void find_prescribed(const Workspace *w) {
+    for (int l = 0; l < w->loads; l++) {
+        w->prescribed[l] = 1;
+        for (ptrdiff_t run = 0; run < w->batch_size; run++)
+            if (w->inputs[INERTIA][l * w->batch_size + run] != 0) w->prescribed[l] = 0;
+    }
+    for (int group = 0; group < w->groups_of_vehicles; group++) {
+        const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
+        for (int64_t i = 0; i < numbers[COUNT] * numbers[WHEELS]; i++)
+            w->prescribed[numbers[FIRST_WHEEL] + i] = 0;
+    }
 }
 
 /* Time after which no load is on the beam. */
@@ -72,6 +90,7 @@ static void integrate_task(Workspace *w) {
     reset(w);
     prepare_task(w);
     set_vehicle_times(w);
+    find_prescribed(w);
     const double exit_time = last_exit(w);
     int panel = 0;
     int64_t done = 0, before = 0;

@@ -66,13 +66,15 @@ static inline void store(double *to, Register values, int count) {
 }
 
 /* Solve (1 + m_i G_ij) r_j = -d_i in place by elimination without pivoting: model/contact.py,
- * `solve_contact_forces`. */
-static inline ALWAYS_INLINE void solve_contact_system(Register *matrix, Register *right, int size) {
+ * `solve_contact_forces`. The first r are `given`, of which the matrix needs no rows. */
+static inline ALWAYS_INLINE void solve_contact_system(Register *matrix, Register *right, int size,
+                                                      int given) {
 #pragma GCC unroll 8
-    for (int i = 0; i < size; i++) {
+    for (int i = given; i < size; i++) {
         Register *row = matrix + i * size;
+        for (int k = 0; k < given; k++) right[i] -= row[k] * right[k];
 #pragma GCC unroll 8
-        for (int k = 0; k < i; k++) {
+        for (int k = given; k < i; k++) {
             Register factor = row[k] * matrix[k * size + k]; /* the diagonal has been inverted */
 #pragma GCC unroll 8
             for (int j = k + 1; j < size; j++) row[j] -= factor * matrix[k * size + j];
@@ -81,9 +83,9 @@ static inline ALWAYS_INLINE void solve_contact_system(Register *matrix, Register
         row[i] = 1 / row[i];
     }
 #pragma GCC unroll 8
-    for (int j = size - 1; j >= 0; j--) {
+    for (int j = size - 1; j >= given; j--) {
         right[j] *= matrix[j * size + j];
 #pragma GCC unroll 8
-        for (int i = 0; i < j; i++) right[i] -= matrix[i * size + j] * right[j];
+        for (int i = given; i < j; i++) right[i] -= matrix[i * size + j] * right[j];
     }
 }

@@ -107,7 +107,7 @@ static void step_matrices(const Workspace *w, const Step *step) {
         const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES;
         for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
             force_response_at_nodes(w, step, s, first);
-            for (int motion = 0; motion < w->motions; motion++)
+            for (int motion = 0; s >= step->prescribed && motion < w->motions; motion++)
                 contact_at_nodes(w, step, s, first, motion);
         }
         for (int f = 0; f < NODES; f++)

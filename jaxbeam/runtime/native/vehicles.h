@@ -55,13 +55,14 @@ void set_vehicle_times(Workspace *w) {
 
 /* Add the springs of vehicles to contact equations, `matrix` times forces = `right`. */
 static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *step, const Group *g,
-                                              int loads, Register *matrix, Register *right) {
+                                              int loads, int prescribed, Register *matrix,
+                                              Register *right) {
     const int rows = loads * NODES;
     Register *surface = g->surface, *deflection = surface + rows, *velocity = deflection + rows;
     memset(deflection, 0, 2 * (size_t)rows * sizeof *deflection);
     add_product(deflection, step->contact_response[DEFLECTION], rows, g->state, w->states);
     add_product(velocity, step->contact_response[VELOCITY], rows, g->state, w->states);
-    for (int s = 0; s < loads; s++) {
+    for (int s = prescribed; s < loads; s++) {
         const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
         const Register stiffness = load(w->inputs[STIFFNESS] + at, g->count),
                        damping = load(w->inputs[DAMPING] + at, g->count);
@@ -81,13 +82,13 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
         const Vehicle of = vehicle_at(start, states, wheels);
         start += vehicle_registers(states, wheels);
         for (int64_t i = 0; i < numbers[COUNT]; i++, z += states)
-            for (int s = 0; s < loads; s++) {
+            for (int s = prescribed; s < loads; s++) {
                 const int64_t first = numbers[FIRST_WHEEL] + i * wheels,
                               u = wheel_of(step, s, first, wheels);
                 if (u < 0) continue;
                 add_matrix_product(right + s * NODES, of.pull + u * NODES * states, NODES, z,
                                    states, 1);
-                for (int t = 0; t < loads; t++) {
+                for (int t = prescribed; t < loads; t++) {
                     const int64_t v = wheel_of(step, t, first, wheels);
                     if (v < 0) continue;
                     const Register *press = of.press + (u * wheels + v) * NODES * NODES;
@@ -109,12 +110,13 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
 
 /* States of vehicles at the end of a step; its contact forces follow the state of the beam. */
 void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
-    const int rows = step->rows;
+    const int rows = step->rows, prescribed = step->prescribed * NODES;
     const Register *z = g->vehicle_state;
     Register *next = g->next_vehicle_state, *surface = g->surface, *start = vehicles_of(w, step, g);
     memset(next, 0, (size_t)w->vehicle_states * sizeof *next);
     if (rows)
-        add_matrix_product(surface, g->impedance, rows, g->state + w->states, rows, 1);
+        add_matrix_product(surface + prescribed, g->impedance + prescribed * rows,
+                           rows - prescribed, g->state + w->states, rows, 1);
     else if (w->has_surface)
         press_by_profile(w, step, g); /* which no contact forces needed */
     for (int group = 0; group < w->groups_of_vehicles; group++) {
@@ -124,7 +126,7 @@ void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
         start += vehicle_registers(states, wheels);
         for (int64_t i = 0; i < numbers[COUNT]; i++, z += states, next += states) {
             add_matrix_product(next, of.transition, states, z, states, 1);
-            for (int s = 0; s < step->loads; s++) {
+            for (int s = step->prescribed; s < step->loads; s++) {
                 const int64_t v = wheel_of(step, s, numbers[FIRST_WHEEL] + i * wheels, wheels);
                 if (v < 0) continue;
                 add_matrix_product(next, of.input + v * states * NODES, states, surface + s * NODES,

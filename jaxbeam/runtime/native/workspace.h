@@ -98,13 +98,14 @@ enum { HEIGHT, HEIGHT_RATE, HEIGHT_SECOND_RATE, SURFACE_MOTIONS };
 
 /* A step and its matrices, stored by columns: contact response (state, row), contact compliance
  * (row, row), both of each motion, force response (row, state), sample rows (state, row and end,
- * sample). Rows are the Gauss nodes of all loads on the beam. Outputs that follow forces at once use
+ * sample). Rows are the Gauss nodes of all loads on the beam; the forces of the first are
+ * prescribed, and they have no contact response and compliance. Outputs that follow forces at once use
  * those at the ends of the step, too, two for each load: end response (end, state, load) and
  * compliance (end, load, load). */
 typedef struct {
     int64_t number;        /* among all steps of the task */
     int64_t event, sample; /* at its start, -1 for none */
-    int panel, kind, mark, loads, rows, ends;
+    int panel, kind, mark, loads, prescribed, rows, ends;
     double start, length;
     const double *transition;
     int64_t *load_numbers;
@@ -151,6 +152,8 @@ typedef struct {
     double *const *outputs;
     /* Of the task: series of mode shapes and their derivatives. */
     double *series;
+    /* Whether the force of each wheel is prescribed: it has neither mass nor spring. */
+    int64_t *prescribed;
     /* Of each step length: propagators, with nodes, forces or samples as the last axis. */
     double *node_transition, *node_force_response, *transition, *force_response, *sample_rows,
         *sample_response;
@@ -216,6 +219,7 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     size_t positions = (size_t)w->positions, all_modes = (size_t)w->all_modes,
            modes = (size_t)w->modes;
     w->series = allocate(start, &used, (size_t)w->segments * w->terms * w->columns);
+    w->prescribed = allocate(start, &used, (size_t)w->loads);
     w->node_transition = allocate(start, &used, lengths * node_transition_size(w));
     w->node_force_response = allocate(start, &used, lengths * node_force_response_size(w));
     w->transition = allocate(start, &used, lengths * transition_size(w));
