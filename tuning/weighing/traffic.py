@@ -31,11 +31,10 @@ from tuning.logs.readers.headings import epoch_seconds
 from tuning.logs.reading import read_log, version_of
 from tuning.modal.preprocessing import with_channels
 from tuning.weighing.axle_fit import AxleFit, CrossingLog, interpolated, telling_sensors
+from tuning.weighing.axles import MOST_EXCESS, with_free_frequency
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines, lines_for
-from tuning.weighing.search import with_free_frequency
 from tuning.weighing.vehicles import (
     LEAST_GAP,
-    MOST_EXCESS,
     axles_of_pulses,
     pulse_times,
     vehicles_in,

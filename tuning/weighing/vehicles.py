@@ -1,6 +1,6 @@
 """Vehicles on a beam in a part of a log: one by one, one behind the other, or meeting each other.
 
-The axles of one speed are found first (`search`). A gap too long for one vehicle separates two.
+The axles of one speed are found first (`axles`). A gap too long for one vehicle separates two.
 If residuals exceed noise and dynamic wheel forces, or these forces exceed those of usual roads, two
 trains of axles of two speeds are tried instead. Each vehicle is then weighed in the readings less
 those of the others, whose parameters get a wide prior, so that its covariance is the marginal one.
@@ -21,8 +21,8 @@ import scipy.signal
 from jaxtyping import Float
 
 from tuning.weighing.axle_fit import AxleFit, AxleTrain, CrossingLog, fit_axles, unlikeliness
+from tuning.weighing.axles import MOST_EXCESS, find_axles, most_likely, two_trains
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
-from tuning.weighing.search import find_axles, most_likely, two_trains
 
 LEAST_PULSE = 6.0, 0.15  # smallest pulse: times the noise; fraction of the largest pulse
 MOST_GAP = 12.0  # m, between the axles of one vehicle
@@ -121,7 +121,6 @@ def _vehicle(first, second, places: tuple[float, float], length: float) -> AxleG
     return AxleGeometry(speed, float(entries[0]), offsets, length)
 
 
-MOST_EXCESS = 1.5  # of the variance of residuals, above which axles or lines are unlikely
 MOST_SHARE = 2.0  # times the usual dynamic wheel forces
 ROUNDS = 2  # of weighing each vehicle in the readings less those of the others
 NEAR = 0.88, 1.12  # range of speeds of a second search, over the speed of a vehicle

@@ -19,9 +19,8 @@ from tuning.weighing import (
     weigh_axles,
 )
 from tuning.weighing.axle_fit import CrossingLog
-from tuning.weighing.axles import AxleWeighing
+from tuning.weighing.axles import AxleWeighing, find_axles
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict
-from tuning.weighing.search import find_axles
 from tuning.weighing.weigh import moses
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5
