@@ -47,27 +47,8 @@ class VehicleBody(ReprWithUnits):
     """Rigid body; without `inertia` it has a height only, like the lumped mass of an axle.
 
     >>> import jaxbeam as jb
-    >>> case = jb.Case(
-    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
-    ...     sensors=[jb.Sensor(10.0)],
-    ...     loads=[
-    ...         jb.vehicles.VehicleLoad(
-    ...             speed=20.0,
-    ...             bodies=[jb.vehicles.VehicleBody("car", mass=1500.0, inertia=2500.0)],
-    ...             axles=[
-    ...                 jb.vehicles.VehicleAxle(
-    ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
-    ...                 ),
-    ...                 jb.vehicles.VehicleAxle(
-    ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
-    ...                 ),
-    ...             ],
-    ...         )
-    ...     ],
-    ...     run=jb.Run(1.0),
-    ... )
-    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
-    0.246 mm
+    >>> print(jb.vehicles.VehicleBody("car", mass=1500.0, inertia=2500.0))
+    VehicleBody(name='car', mass=1500 kg, inertia=2500 kg m^2)
     """
 
     name: str = choice("name of the body")
