@@ -22,7 +22,6 @@ Trans. Automatic Control 36, 1991): the rows E of the limits, of the next period
 of which those of all later periods follow if those of period T do.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,7 +31,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.control.crossing_gains import crossing_plant
-from jaxbeam.model.contact import vehicle_system
+from jaxbeam.estimation.sampled_plant import step_count
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import MAX_HALVINGS
 from jaxbeam.numerics.riccati import dare, dlqr
@@ -48,7 +47,6 @@ from jaxbeam.numerics.stages import (
 from jaxbeam.runtime.arrays import (
     Array,
     Module,
-    any_jax,
     map_elements,
     scan,
     searchsorted,
@@ -221,11 +219,6 @@ def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
     return jax.tree.map(lambda part: xp.broadcast_to(part, (periods, *part.shape)), plant)
 
 
-# Largest number of cells of a period, or of each part before and after a delayed command begins;
-# and largest phase of the fastest mode, or of a vehicle, in one. Commands are exact to some 1e-9.
-CELLS, MAX_PHASE_PER_CELL = 8, 0.6
-
-
 class Preview(Module):
     """Plant under its loads, with the parts of its discrete-time maps that all samples have.
 
@@ -312,7 +305,7 @@ class Preview(Module):
 def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | None) -> Preview:
     """Preview of a plant with its loads for commands held over a period, after a delay (s)."""
     constant_plant, coupling_at = crossing_plant(plant, with_weights=True)
-    explicit, per_part = plant.loads.massless, _cell_count(plant, period)
+    explicit, per_part = plant.loads.massless, step_count(plant, period)
     fractions = np.arange(per_part) / per_part
     marks = [xp.zeros(()), *([] if delay is None else [delay]), period]
     parts = list(zip(marks[:-1], marks[1:], strict=True))
@@ -353,16 +346,6 @@ def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | No
     start = xp.eye(size, size + constant_plant.B.shape[1])
     _, maps = scan(advance, start, (follows, *pieces))
     return Preview(plant, period, delay, edges, responses, index, maps)
-
-
-def _cell_count(plant: Plant, period: Float[Array, ""]) -> int:
-    """Number of cells of a period (s), or of each of its two parts."""
-    rates = plant.modal_model.modes.angular_frequencies
-    if any_jax(plant, period):
-        return CELLS
-    if plant.vehicle_states:
-        rates = np.append(rates, np.abs(np.linalg.eigvals(vehicle_system(plant.loads)[0])))
-    return min(CELLS, math.ceil(period * np.max(rates) / MAX_PHASE_PER_CELL))
 
 
 def cell_maps(

@@ -283,7 +283,8 @@ class AbstractStateController(AbstractController):
                 filter = ContinuousWithVehicles(filter, design_plant)
             return ContinuousStateLaw(law, filter)
         if simulates:
-            filter = SampledWithVehicles(filter, design_plant, sample_timing(self))
+            timing = sample_timing(self).varying(design_plant)
+            filter = SampledWithVehicles(filter, design_plant, timing)
         return SampledStateLaw(law, filter)
 
     def breakpoints(self, case):

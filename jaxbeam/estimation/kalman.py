@@ -189,6 +189,7 @@ class Kalman(AbstractKalmanEstimator):
                 transition.matrix, C, transition.noise_covariance, sensors.noise_covariance
             )
             return ConstantGainFilter(transition, C, D, sensor_offsets(plant), gain, plant_states)
+        timing = timing.varying(filtered_model)
         sensors = sensor_chain(plant, variance, timing, states + loads, self.max_delay_periods)
         no_state, load_states = xp.zeros(sensors.state_count), np.s_[states : states + loads]
         return CrossingFilter(
@@ -374,7 +375,7 @@ class ExtendedKalman(AbstractKalmanEstimator):
         intensity = modal_noise_intensity(filtered.plant, self.process_noise)
         states, gravity = intensity.shape[0], plant.case.run.gravity
         end = states + NUMBERS * loads
-        variance = reading_variance(plant, self.measurement_noise)
+        variance, timing = reading_variance(plant, self.measurement_noise), timing.varying(plant)
         sensors = sensor_chain(plant, variance, timing, end, self.max_delay_periods)
         start = -timing.period  # s, one period before the first sample
         position, speed, _ = plant.loads.kinematics(start)

@@ -8,6 +8,7 @@ analogue filters of the sensors; h, for a sensor with a delay, its last samples,
 states m of digital filters; and the noise v of the samples that these filters receive.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -19,7 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import filter_step
+from jaxbeam.model.contact import vehicle_system
 from jaxbeam.model.sensor_signals import Sections, sensor_sections, with_sensor_filters
 from jaxbeam.model.state_space import Plant, StateSpace
 from jaxbeam.numerics.stages import exponential_and_gramian
@@ -69,11 +72,38 @@ class Transition(Module):
         )
 
 
+# Largest number of steps of a period, or of each part before and after a delayed command begins;
+# and largest phase of the fastest mode, or of a vehicle, in one.
+MAX_STEPS, MAX_PHASE_PER_STEP = 8, 0.6
+
+
+def step_count(plant: Plant, period: Number) -> int:
+    """Number of steps of a period (s), or of each of its two parts, for a plant that varies."""
+    rates = plant.modal_model.modes.angular_frequencies
+    if not (is_concrete(rates) and is_concrete(period)):
+        return MAX_STEPS
+    fastest = np.max(concrete(rates))
+    if plant.vehicle_states:
+        system = vehicle_system(plant.loads)[0]
+        if not is_concrete(system):
+            return MAX_STEPS
+        fastest = max(fastest, np.max(np.abs(np.linalg.eigvals(concrete(system)))))
+    return min(MAX_STEPS, math.ceil(float(concrete(period)) * fastest / MAX_PHASE_PER_STEP))
+
+
 class SampleTiming(Module):
-    """Sampling period (s), and delay (s) within it after which a command begins, or None."""
+    """Sampling period (s), and delay (s) within it after which a command begins, or None.
+
+    Of a plant that varies in time each part of a period takes so many `steps`.
+    """
 
     period: Number
     input_delay: Number | None
+    steps: int = eqx.field(static=True, default=1)
+
+    def varying(self, plant: Plant) -> "SampleTiming":
+        """Timing for a plant that varies in time, whose fastest mode its steps follow."""
+        return dataclasses.replace(self, steps=step_count(plant, self.period))
 
     def sample_at(self, t: Number) -> Int[Array, ""]:
         """Number of the sample at t (s)."""
@@ -89,7 +119,7 @@ class SampleTiming(Module):
         """Transition to the sample at t (s), or to several, from the one before.
 
         With white noise on x'. Exact for a time-invariant plant; else by Magnus' method of order 4,
-        with one exponential between any two changes of the command. `scale` are the magnitudes of
+        in `steps` between any two changes of the command. `scale` are the magnitudes of
         the states, from `numerics.stages.balance`.
         """
         parts, _, _ = self.transitions(matrices_at, noise_intensity, scale, t)
@@ -114,20 +144,19 @@ class SampleTiming(Module):
         ends = xp.sort(xp.stack([*cuts, self.period]))
         starts = xp.concatenate([xp.zeros(1), ends[:-1]])
         before_command = ends <= input_delay
-        steps = _magnus_steps(
-            matrices_at,
-            noise_intensity,
-            scale,
-            xp.asarray(t, float)[..., None] - self.period + starts,
-            ends - starts,
-        )
-        parts = []
-        for k in range(ends.shape[0]):
+        spans = xp.repeat((ends - starts) / self.steps, self.steps)
+        begun = xp.repeat(starts, self.steps) + np.tile(np.arange(self.steps), len(ends)) * spans
+        first = xp.asarray(t, float)[..., None] - self.period
+        steps = _magnus_steps(matrices_at, noise_intensity, scale, first + begun, spans)
+
+        def step(k):
             matrix, inputs, noise = (part[..., k, :, :] for part in steps)
-            previous, present = (
-                xp.where(acts, inputs, 0.0) for acts in (before_command[k], ~before_command[k])
-            )
-            parts.append(Transition(matrix, previous, present, noise))
+            before = before_command[k // self.steps]
+            previous, present = (xp.where(acts, inputs, 0.0) for acts in (before, ~before))
+            return Transition(matrix, previous, present, noise)
+
+        each = [map(step, range(k, k + self.steps)) for k in range(0, len(spans), self.steps)]
+        parts = [functools.reduce(Transition.compose, part) for part in each]
         return parts, ends, before_command
 
 

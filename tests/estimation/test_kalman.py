@@ -19,8 +19,8 @@ from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
 from tests.control.optimal.test_scheduled_lqr import LENGTH, REST, expected_command, polynomial_law
 from tests.differences import central
-from tests.loop_as_oracle import expected, parts_of
-from tests.oracles.sampled_plant import SampledPlant, conditioned
+from tests.loop_as_oracle import expected, parts_of, span_of
+from tests.oracles.sampled_plant import SampledPlant, conditioned, over_period
 
 PERIOD = 1e-3
 NOISE = np.array([1e-5, 2e-4, 0.05, 5e-7])
@@ -215,6 +215,43 @@ def test_accelerations_under_a_followed_mass():
 
 def deflections_by_scipy(case):
     return expected(case, np.arange(0.0, float(case.run.duration), EXTENDED_PERIOD)).deflection
+
+
+@pytest.mark.parametrize(("period", "rtol"), [(2e-3, 2e-5), (5e-3, 5e-4)])
+def test_a_period_of_fast_modes_under_a_mass_by_scipy(period, rtol):
+    """In one step of Magnus' method it was 4 and 64 % off, at up to 4 and 10 rad in a period."""
+    mass, speed, t = 0.4, 4.0, 0.08
+    case = crossing(jb.MovingMass(mass=mass, speed=speed), modes=4)
+    case = dataclasses.replace(case, controller=jb.Prescribed([0.0], period=period))
+    plant, span = jb.state_space(case), span_of(case)
+    timing = sample_timing(case.controller)
+
+    def matrices_at(time):
+        x = speed * time
+        under, slope, curvature = (span.shapes(x, order) for order in range(3))
+        stiffness = np.diag(span.frequencies**2) + mass * speed**2 * np.outer(under, curvature)
+        damping = span.damping + 2 * mass * speed * np.outer(under, slope)
+        forces = np.stack([span.shapes(0.4), -under], axis=1)
+        rates = np.hstack([-stiffness, -damping, forces])
+        rates = np.linalg.solve(np.eye(span.modes) + mass * np.outer(under, under), rates)
+        A = np.vstack([np.eye(span.modes, 2 * span.modes, k=span.modes), rates[:, :-2]])
+        return A, np.vstack([np.zeros((span.modes, 2)), rates[:, -2:]])
+
+    (A, B), at = over_period(matrices_at, t - period, t), np.asarray(t)
+    known = Kalman(1e-2, 1e-5, loads="known").sampled_filter(plant, timing)
+    found, states, size = known.model_at(at)[0], 2 * span.modes, np.abs(A).max(axis=0)
+    assert_allclose(found.matrix[:states, :states] / size, A / size, atol=rtol)
+    assert_allclose(found.matrix[:states, states], B[:, 1], atol=rtol * np.abs(B[:, 1]).max())
+    assert_allclose(found.input_matrix[:states, 0], B[:, 0], atol=rtol * np.abs(B[:, 0]).max())
+    following = FOLLOWS.sampled_filter(plant, timing)
+    memory = following.initial_state()
+    numbers = np.array([speed * (t - period), speed, mass])
+    for i, column in enumerate(A.T):
+        state = np.append(np.eye(states)[i] * 1e-3 / size[i], numbers)
+        command = np.ones(1)
+        found, _ = following.predict(memory._replace(x=state, command=command), command, at)
+        expected = 1e-3 * column / size[i] + B[:, 0] + 9.81 * mass * B[:, 1]
+        assert_allclose(found[:states], expected, atol=rtol * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(
