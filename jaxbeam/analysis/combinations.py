@@ -178,7 +178,7 @@ def combine(
     6.98e+06 N m
     """
     check_quantity(quantity)
-    x = np.atleast_1d(np.asarray(concrete(x), float))
+    x = np.atleast_1d(np.asarray(concrete(x, "x"), float))
     extremes = {
         name: action_extremes(case, action, x, quantity, f"actions.{name}")
         for name, action in actions.items()

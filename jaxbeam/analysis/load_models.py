@@ -14,6 +14,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import check_on_beam, concrete, refuses_traced, suggestion
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import quantity_of
+from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.track import Kernel
 from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections
@@ -98,17 +99,17 @@ def load_model_envelope(
     x=None,
     *,
     quantity: str = "moment",
-    lane: float | None = None,
-    allowance: float | None = None,
+    lane: float | str | None = None,
+    allowance: float | str | None = None,
 ) -> LoadModelEnvelope:
     """Static envelope of a load model of a code at positions x (m), by default along the beam.
 
     One vehicle of the `model`, a name of `load_models` or a train of the library, stands wherever
     it is worst, in either direction, in part on the beam; its varied spacing has the worst of its
-    values. All axles on the beam count, those that relieve too. The `lane` load (N/m) lies on all
-    parts where it is unfavourable. `allowance` is added to effects of axles. Both are by default
-    those of the model. Quantities are those of `influence_line`; of what jumps at a position both
-    sides count. The case's own loads do not.
+    values. All axles on the beam count, those that relieve too. The `lane` load (N/m, or "9 kN/m")
+    lies on all parts where it is unfavourable. `allowance` is added to effects of axles. Both are
+    by default those of the model. Quantities are those of `influence_line`; of what jumps at a
+    position both sides count. The case's own loads do not.
 
     Raises ValueError as `influence_line`, for an unknown model, and for a lane load or an allowance
     below 0.
@@ -121,13 +122,14 @@ def load_model_envelope(
     4.17e+06 N m
     """
     chosen = load_model(model) if isinstance(model, str) else model
-    allowance = chosen.allowance if allowance is None else allowance
+    lane = None if lane is None else number_in_si(lane, "N/m", "lane")
+    allowance = chosen.allowance if allowance is None else number_in_si(allowance, "1", "allowance")
     for name, value in (("lane", lane or 0.0), ("allowance", allowance)):
         if not 0 <= value < np.inf:
             raise ValueError(f"{name} must be 0 or more, not {value:g}")
     if x is None:
         x = held_positions(case) if quantity == REACTION else positions_along(case, POSITIONS)
-    x = np.atleast_1d(np.asarray(concrete(x), float))
+    x = np.atleast_1d(np.asarray(concrete(x, "x"), float))
     check_on_beam("x", x, case.beam.length)
     points, left_of = x, np.zeros(0, int)
     check_quantity(quantity)
@@ -152,14 +154,16 @@ def load_model_envelope(
 
 @refuses_traced("an envelope of a load model")
 def crossing_envelope(
-    case: Case, model: str | LoadModel, speed: float, x, *, quantity: str = "moment"
+    case: Case, model: str | LoadModel, speed: float | str, x, *, quantity: str = "moment"
 ) -> Envelope:
     """Dynamic envelope at positions x (m) of the vehicles of a load model, one after another.
 
-    Each crosses from the left at a `speed` (m/s) with the least of its varied spacing, as moving
-    forces without allowance and lane load, and the run goes on for one period of the lowest mode.
+    Each crosses from the left at a `speed` (m/s, or "80 km/h") with the least of its varied
+    spacing, as moving forces without allowance and lane load, and the run goes on for one period of
+    the lowest mode.
     Raises as `envelope`, and ValueError for an unknown model or a speed that is not above 0.
     """
+    speed = number_in_si(speed, "m/s", "speed")
     if not 0 < speed < np.inf:
         raise ValueError(f"the speed of a crossing must be above 0 m/s, not {speed:g}")
     chosen = load_model(model) if isinstance(model, str) else model

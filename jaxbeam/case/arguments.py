@@ -84,11 +84,14 @@ def fits(value: Any, declared: Any) -> bool:
             return isinstance(value, Collection) and len(value) == len(parts)
         return all(fits(one, parts[0]) for one in value) if _is_checked(parts[0]) else True
     if origin in (Mapping, dict):
-        return isinstance(value, Mapping)
+        own = parts[1:] if _is_mapping(parts[-1]) else ()
+        return isinstance(value, Mapping) and all(fits(one, *own) for one in value.values() if own)
     if origin is Callable:
         return callable(value)
     if declared is int:
         return _is_whole(value)
+    if declared is Mapping:
+        return isinstance(value, Mapping)
     if declared is bool:
         return isinstance(value, bool | np.bool_)
     if declared in (str, type(None)) or _is_own(declared):
@@ -102,6 +105,10 @@ def _is_checked(declared: Any) -> bool:
 
 def _is_own(declared: Any) -> bool:
     return isinstance(declared, type) and declared.__module__.startswith(OWN_PACKAGES)
+
+
+def _is_mapping(declared: Any) -> bool:
+    return typing.get_origin(declared) in (Mapping, dict) or declared is Mapping
 
 
 def _is_whole(value: Any) -> bool:
@@ -135,6 +142,8 @@ def _description(declared: Any) -> str:
         return f"a list of {len(parts)} numbers"
     if origin in (Sequence, tuple, list):
         return f"a list of {_name(parts[0])}" if _is_own(parts[0]) else "a list"
+    if origin in (Mapping, dict) and _is_mapping(parts[-1]):
+        return "a mapping of mappings, as {'name': {'key': ...}}"
     if origin in (Mapping, dict):
         return "a mapping by names or addresses, as {'beam.length': ...}"
     if origin is Callable:

@@ -151,6 +151,12 @@ def test_trains_of_the_library_are_load_models():
         load_model_envelope(SPAN, "LM1", [10.0], lane=-1.0)
     with pytest.raises(ValueError, match="allowance must be 0 or more, not inf"):
         load_model_envelope(SPAN, "LM1", [10.0], allowance=np.inf)
+    with pytest.raises(
+        ValueError, match="lane must be in N/m, or a unit of the same kind, not '9 kN'"
+    ):
+        load_model_envelope(SPAN, "LM1", [10.0], lane="9 kN")
+    with pytest.raises(ValueError, match="speed must be in m/s, or a unit of the same kind"):
+        crossing_envelope(SPAN, "LM1", "80 km", [10.0])
     with pytest.raises(ValueError, match="a crossing must be above 0 m/s, not 0"):
         crossing_envelope(SPAN, "LM1", 0.0, [10.0])
     with pytest.raises(ValueError, match="EN15528-D2 has masses of its axles"):

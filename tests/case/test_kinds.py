@@ -292,6 +292,7 @@ def test_it_is_said_that_a_case_is_needed(tmp_path):
 WORDS = """
 import jaxbeam as jb
 from jaxbeam.analysis.combinations import combine
+from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
 case = jb.Case(
     jb.Beam(1.0, 11.68, 0.535), sensors=[jb.Sensor(0.5)],
     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
@@ -319,6 +320,14 @@ asked = [
         lambda word: combine(case, {"a": {"uniform": 1.0}}, {"c": {"a": word}}, [0.5]),
         "combinations.c.a is a factor, or two",
     ),
+    (
+        lambda word: combine(case, {"a": {"uniform": 1.0}}, {"c": word}, [0.5]),
+        "combinations takes a mapping of mappings",
+    ),
+    (lambda word: combine(case, {"a": word}, {}, [0.5]), "actions takes a mapping of mappings"),
+    (lambda word: load_model_envelope(case, "LM1", [0.5], lane=word), "lane takes a number in N/m"),
+    (lambda word: crossing_envelope(case, "LM1", word, [0.5]), "speed takes a number in m/s"),
+    (lambda word: load_model_envelope(case, "LM1", word), "x must be a real number"),
     (lambda word: jb.ride.weighted_rms(word, [1.0]), "times takes numbers in s"),
     (lambda word: jb.ride.sperling_index([0.0], word), "acceleration takes numbers in m/s^2"),
     (lambda word: jb.statics.static_peak(case, 0.5, word), "layout takes a jaxbeam.Layout or"),

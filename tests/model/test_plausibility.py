@@ -428,12 +428,21 @@ TABLE = {"kind": "mass", "mass": 30e3, "positions": [0.0, 25.0]}
 ROLLED = [[2e3, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
 PPF = {"kind": "ppf", "gains": [-300.0, -300.0], "damping_ratio": 0.5, "period": 0.002}
 BUMP = {"kind": "bump", "start": 1e3, "end": 2e3, "height": 0.03}
+HERTZ = {"kind": "unilateral", "hertz_stiffness": 9e10}  # N/m^1.5, of a wheel on a rail
 MISTAKES = [
     # Frequencies in rad/s, stroke, foundation, waves
     ("damped", "absorbers.0.frequency", 11.5 * 2 * math.pi, "", "11.5 Hz"),
     ("bridge", "absorbers.0", STANDING | {"frequency": 21.9}, ".frequency", "3.49 Hz"),
     ("coil", "controller", PPF | {"frequency": 4.9 * 2 * math.pi}, ".frequency", "not in rad/s"),
     ("damped", "absorbers.0.max_stroke", 20.0, "", "in m, not in mm"),
+    ("bridge", "contact", HERTZ | {"hertz_stiffness": 90e3}, ".hertz_stiffness", "N/m^1.5, not"),
+    (
+        "bridge",
+        "contact",
+        {"kind": "unilateral", "stiffness": 1e3},
+        ".stiffness",
+        "in N/m, not in MN",
+    ),
     ("rail", "beam.foundation_stiffness", 40e3, "", "in N/m^2, not in kN/m^2"),
     ("bridge", "beam.foundation_stiffness", 20e3, "", "in N/m^2, not in kN/m^2"),
     ("cars", "profile.wavelength", 4000.0, "", "in m, not in mm"),
@@ -737,6 +746,17 @@ def test_absorbers_and_foundations_of_use_look_right():
         bridge(beam={"foundation_stiffness": 5e7}),
     ):
         assert jb.check(case).warnings == ()
+
+
+def test_a_spring_between_wheel_and_rail_looks_right():
+    assert jb.check(changed(parsed(BASES["bridge"]), "contact", HERTZ)).warnings == ()
+
+
+def test_an_eccentricity_in_millimetres_is_noticed():
+    box = {"torsional_rigidity": 2e10, "polar_inertia": 4e4}
+    assert jb.check(bridge(box, load={"eccentricity": -2.0})).warnings == ()
+    (sentence,) = jb.check(bridge(box, load={"eccentricity": -2e3})).warnings
+    assert sentence.startswith("loads.0.eccentricity: ") and "in m, not in mm" in sentence
 
 
 def test_soft_springs_beside_each_other_do_not_clamp():

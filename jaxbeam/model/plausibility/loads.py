@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbeam.case.contact import UnilateralContact
 from jaxbeam.case.sensors import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.elements import NODE_TOLERANCE
@@ -43,6 +44,19 @@ def sag_of_spring(facts):
     for stage in facts.stages:
         if stage.stiffness > 0:
             yield Value(stage.spring, stage.carried * GRAVITY / stage.stiffness)
+
+
+def compression_of_contact(facts):
+    """Static compression of the spring of contact by the heaviest wheel, over the beam's length."""
+    contact = facts.case.contact
+    spring = contact.spring() if isinstance(contact, UnilateralContact) else None
+    if spring is not None and facts.case.loads:
+        heaviest = max(float(np.max(one)) for one in facts.static_loads)
+        name, unit = "stiffness", "N/m"
+        if contact.hertz_stiffness is not None:
+            name, unit = "hertz_stiffness", "N/m^1.5"
+        compression = (max(heaviest, 0.0) / spring[0]) ** (1 / spring[1])
+        yield Value(f"contact.{name}", compression / facts.length, {"unit": unit})
 
 
 def stage_damping(facts):
