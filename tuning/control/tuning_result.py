@@ -277,7 +277,7 @@ def _detuned_table(run_sets: list[RunSetResult]) -> list[str]:
     if not run_sets[0].detuned:
         return []
     rows = [
-        [f"{error:+.0%}", *(f"{o.detuned[i]:.4g}" for o in run_sets)]
+        [f"{error:+.0%}" if error else "none", *(f"{o.detuned[i]:.4g}" for o in run_sets)]
         for i, error in enumerate(DETUNING)
     ]
     header = ["error", *(outcome.name for outcome in run_sets)]
