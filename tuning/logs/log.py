@@ -165,7 +165,7 @@ def check_samples(
         what = "the cell is empty, or says nan" if np.isnan(value) else f"{value} is not finite"
         raise ValueError(
             f"{where(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
-            'log there, or leave such samples out, by missing="mask" or --mask missing'
+            'log there, or leave such samples out, by missing="mask" or --missing mask'
         )
     huge = np.argwhere(np.abs(values) > MAX_SIZE)
     if huge.size:

@@ -74,6 +74,14 @@ def test_traces_of_a_seismic_recorder(tmp_path):
     kept = log.valid[:, 0]
     np.testing.assert_allclose(log.values[kept, 0], 1e-3 * counts[kept], rtol=1e-12)
     np.testing.assert_allclose(log.values[:, 1], 2e-3 * counts, rtol=1e-12)
+    about = {"station": "B2", "channel": "HNZ", "sampling_rate": 100.0, "starttime": start}
+    slow = obspy.Trace(counts[::2].copy(), about)
+    obspy.Stream([*parts, slow]).write(tmp_path / "rates.mseed", format="MSEED")
+    units = {"XX.B1.HNZ": "mm", "B2.HNZ": "mm"}
+    with pytest.warns(LogWarning, match="interpolated to 200 Hz"):
+        joined = read_log(tmp_path / "rates.mseed", units=units, missing="mask")
+    np.testing.assert_array_equal(np.flatnonzero(~joined.valid[:, 0]), np.arange(900, 1000))
+    np.testing.assert_allclose(joined.values[:, 1], 1e-3 * counts[:1999], atol=0.05)
     whole = (tmp_path / "cut.mseed").read_bytes()
     (tmp_path / "cut.mseed").write_bytes(whole[: len(whole) - 700])
     with pytest.warns(LogWarning, match="the file is cut off within a record"):
@@ -96,10 +104,33 @@ def test_groups_of_a_measurement_file_are_joined_by_their_times(tmp_path):
     np.testing.assert_allclose(log.values[:, 0], 1e-3 * np.sin(20 * times), rtol=1e-12)
     np.testing.assert_allclose(log.values[:, 1], 1e-3 * np.sin(5 * times), atol=1e-7)
     assert log.start == "2026-03-29T23:59:58.002+00:00"  # of the first time in common
-    uneven = np.append(TIMES[:-1], 1.0)
-    mdf(tmp_path / "uneven.mf4", [(uneven, {"d1": D1}), (slow, {"d2": slow})])
-    with pytest.raises(ValueError, match=r"uneven.mf4: the times of d1 are uneven, and other"):
-        read_log(tmp_path / "uneven.mf4")
+
+
+def test_groups_of_a_measurement_file_with_uneven_times(tmp_path):
+    """Messages late by up to 0.4 steps, and a silence of 0.1 s, beside an even group of 3 Hz.
+
+    Cubic splines through samples at most h apart err by 5 (h w)^4 / 384 inside, at uneven steps and
+    near ends by some times as much; beside the silence the spline bends across it.
+    """
+    rng, step, w = np.random.default_rng(3), 2e-3, 2 * np.pi * 3
+    even = np.arange(1000) * step
+    late = even + rng.uniform(0, 0.4, even.size) * step
+    late[[0, -1]] = even[[0, -1]]
+    spoken = late[(late < 0.8) | (late > 0.9)]
+    groups = [(spoken, {"d1": np.sin(w * spoken)}), (even, {"d2": np.cos(w * even)})]
+    mdf(tmp_path / "bus.mf4", groups)
+    said = r"d1: uneven times, steps of 0.00\d+ to 0.1\d* s, interp", "from rates and starts"
+    uneven, joined = (pytest.warns(LogWarning, match=words) for words in said)
+    with uneven, joined:
+        log = read_log(tmp_path / "bus.mf4", missing="mask")
+    d1, d2 = log.values.T
+    silent = ~log.valid[:, 0]
+    assert 45 < silent.sum() < 52 and np.all(np.abs(log.times[silent] - 0.85) < 0.052)
+    exact, far = 1e-3 * np.sin(w * log.times), np.abs(log.times - 0.85) > 0.05 + 10 * step
+    bound = 1e-3 * 4 * 5 / 384 * (1.4 * step * w) ** 4
+    np.testing.assert_allclose(d1[far], exact[far], atol=bound)
+    np.testing.assert_allclose(d1[~silent], exact[~silent], atol=1e-4 * 1e-3)
+    np.testing.assert_allclose(d2, 1e-3 * np.cos(w * log.times), atol=1e-7)
 
 
 def test_a_channel_of_times_and_invalid_samples_of_a_measurement_file(tmp_path):

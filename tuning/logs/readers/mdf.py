@@ -15,6 +15,7 @@ from tuning.logs.readers.table import (
     Clock,
     LogFormat,
     LogTable,
+    at_times,
     damaged_file_error,
     date_of,
     is_time_name,
@@ -30,12 +31,12 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
     """Table of the one run of a measurement file, by the name "".
 
     Channels of one group have its times. Those of several groups, as at other rates, are joined by
-    the start and step of each, with a warning. Channels of text are left out; a name that several
-    groups have, or that is one of times, gets the number of the group. Samples that
-    the file marks as invalid are NaN.
+    the start and step of each, with a warning; uneven times, as of messages on a bus, become even
+    by interpolation, with another. Channels of text are left out; a name that several groups have,
+    or that is one of times, gets the number of the group. Samples that the file marks as invalid
+    are NaN.
 
-    Raises ValueError for a damaged file, and for several groups of which one has uneven times;
-    ImportError without asammdf.
+    Raises ValueError for a damaged file, ImportError without asammdf.
     """
     asammdf = import_extra("asammdf", "mdf")
     content = io.BytesIO(read_bytes(path))
@@ -58,8 +59,11 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
     if all(np.array_equal(times, first) for times in clocks.values()):
         table = table_of(str(path), {"time": first, **arrays}, units | {"time": "s"})
         return {"": dataclasses.replace(table, start=date_of(origin + float(first[0])))}
-    own = {name: _clock(path, name, times) for name, times in clocks.items()}
-    return {"": table_of(str(path), arrays, units, own, origin=origin)}
+    own, said = {}, []
+    for name, times in clocks.items():
+        own[name], arrays[name], words = _at_even_times(times, arrays[name])
+        said += [f"{name}: {words}"] if words else []
+    return {"": table_of(str(path), arrays, units, own, said, origin)}
 
 
 @contextlib.contextmanager
@@ -104,15 +108,21 @@ def _groups(asammdf, content) -> tuple[dict[int, tuple[np.ndarray, list]], float
     raise ValueError(problem)
 
 
-def _clock(path: Path, name: str, times: np.ndarray) -> Clock:
-    """Start and step of even times (s) of a channel."""
-    step = (times[-1] - times[0]) / max(1, times.size - 1)
-    if np.any(np.abs(np.diff(times) - step) > EVEN * step):
-        raise ValueError(
-            f"{path}: the times of {name} are uneven, and other groups have others: resample the"
-            " groups to one rate, or save them to separate files"
-        )
-    return Clock(float(times[0]), float(step))
+def _at_even_times(times: np.ndarray, values: np.ndarray) -> tuple[Clock, np.ndarray, str]:
+    """Start and step of the times (s) of values, the values then, and what was done; "" if none.
+
+    Values at uneven times are interpolated to the usual step; NaN where none is within a step.
+    """
+    steps = np.diff(times)
+    mean = (times[-1] - times[0]) / max(1, steps.size)
+    if not np.any(np.abs(steps - mean) > EVEN * mean):
+        return Clock(float(times[0]), float(mean)), values, ""
+    step = float(np.mean(steps[steps < 2 * np.median(steps)]))  # without silences
+    grid = times[0] + step * np.arange(1 + round((times[-1] - times[0]) / step))
+    found = at_times(times, values, grid, step)
+    range_words = f"steps of {steps.min():.3g} to {steps.max():.3g} s"
+    words = f"uneven times, {range_words}, interpolated to {step:.6g} s"
+    return Clock(float(times[0]), step), found, words
 
 
 FORMAT = LogFormat("ASAM MDF", read_mdf, suffixes=(".mf4", ".mdf"), magics=(b"MDF     ",))

@@ -71,10 +71,8 @@ def join_channels(
         if abs(own - step) * times.size < slack and abs(shift - round(shift)) < SAME:
             joined[name] = values[round(shift) : round(shift) + times.size]
             continue
-        from scipy.interpolate import CubicSpline
-
         at = start + own * np.arange(len(values))
-        joined[name] = CubicSpline(at, values, axis=0)(np.clip(times, at[0], at[-1]))
+        joined[name] = at_times(at, values, times, (0.5 + SAME) * own)
         interpolated.append(f"{name} ({1 / own:.6g} Hz, {start:g} s)")
     said = []
     if first > slack or max(ends.values()) - last > min(longest - slack, CUT * last):
@@ -88,6 +86,32 @@ def join_channels(
             f" {_shortened(', '.join(interpolated))}"
         )
     return times, joined, said
+
+
+def at_times(
+    at: Float[np.ndarray, " sample"],
+    values: np.ndarray,
+    times: Float[np.ndarray, " time"],
+    reach: float,
+) -> np.ndarray:
+    """Values at some times, by a cubic spline through the finite samples at the times `at` (s).
+
+    NaN where none of these is within `reach` (s).
+    """
+    from scipy.interpolate import CubicSpline
+
+    columns = []
+    for column in values.reshape(at.size, -1).T:
+        known = at[np.isfinite(column)]
+        found = np.full(times.size, np.nan)
+        if known.size > 1:
+            after = np.clip(np.searchsorted(known, times), 1, known.size - 1)
+            nearest = np.minimum(np.abs(times - known[after - 1]), np.abs(times - known[after]))
+            near = nearest <= reach
+            spline = CubicSpline(known, column[np.isfinite(column)])
+            found[near] = spline(np.clip(times[near], known[0], known[-1]))
+        columns.append(found)
+    return np.stack(columns, axis=-1).reshape(times.size, *values.shape[1:])
 
 
 def _shortened(text: str) -> str:
