@@ -227,8 +227,9 @@ def test_the_address_is_on_one_line_and_answers(server):
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{20,}", server.address)
     with urllib.request.urlopen(server.address) as answer:
         assert answer.status == 200
-    with pytest.raises(urllib.error.HTTPError, match="403"):
+    with pytest.raises(urllib.error.HTTPError, match="403") as refused:
         urllib.request.urlopen(server.address.split("?")[0])
+    refused.value.close()
 
 
 def test_it_listens_to_the_loopback_address_alone(server):

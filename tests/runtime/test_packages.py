@@ -77,6 +77,7 @@ for name in ("getuid", "geteuid", "getgid", "fchmod", "fchown", "sched_getaffini
         delattr(os, name)
 os.process_cpu_count = os.cpu_count  # of Python 3.13, as where there is no sched_getaffinity
 shutil._use_fd_functions = False  # as where there is no O_NONBLOCK
+shutil._rmtree_impl = getattr(shutil, "_rmtree_unsafe", None)  # of Python 3.14
 for name in ("SIGKILL", "SIGHUP", "SIGALRM", "pthread_sigmask", "setitimer", "pthread_kill"):
     if hasattr(signal, name):
         delattr(signal, name)

@@ -196,9 +196,12 @@ class Store(RuleBasedStateMachine):
     that was stopped while it overwrote another, which it continues beside it.
     """
 
+    def __init__(self):
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp())  # before any rule: `teardown` runs without one, too
+
     @initialize()
     def start(self):
-        self.folder = Path(tempfile.mkdtemp())
         self.path = self.folder / "runs.zarr"
         self.begun = self.complete = self.beside = None
         for i, case in enumerate(CASES):
