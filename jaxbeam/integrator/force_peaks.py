@@ -9,7 +9,7 @@ Panels are the intervals between the passages of breaks by forces.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -221,6 +221,7 @@ def _forces_on_beam(system, paths: ForcePaths, run, middle):
     return count, force, piece
 
 
+BASIS_ERROR = 1e-13  # of outputs as sums of others, relative to the largest
 CHUNK_STEPS = 24  # steps of a chunk
 FEW_STEPS = 2  # steps of a chunk that is no longer than these
 REFINEMENTS = 4  # parts into which a step is divided
@@ -305,23 +306,24 @@ class _Search:
         turn = (np.abs(self.poles) * half) ** 2 / 8
         slow = turn < 1
         now, growing = np.where(slow, self.amplitude, 0.0), np.exp(self.poles * half)
-        largest_value = np.zeros(self.bend.shape)
+        index, weights = _basis_of_outputs(system)
+        table = responses.table.reshape(-1, self.C.shape[0])[:, index]
+        self.bound = np.zeros(self.bend.shape)
         for fraction in (0.0, 0.5, 1.0):
-            forced = self._forced(fraction)
+            times = (self.start + fraction * self.length)[:, None]
+            forced = self._from_table(table, self.panel, times, np.zeros(self.panel.size, int))[
+                :, 0
+            ]
             if not fraction:
-                self.first = np.abs(forced + self._free(self.amplitude))
-            values = np.abs(forced + self._free(now))
-            np.maximum(largest_value, values, out=largest_value)
+                values = product(forced + _free(self.amplitude, self.C[index]), weights)
+                self.first = np.abs(values, out=values)
+            values = product(forced + _free(now, self.C[index]), weights)
+            np.maximum(self.bound, np.abs(values, out=values), out=self.bound)
             now = now * growing
-        self.bound = product(size * np.where(slow, turn, 1.0), largest) + largest_value
-        self.bound += forced_bend * half**2 / 8 + self.slack
-        self.tables = np.ascontiguousarray(np.moveaxis(responses.table, 2, 0))
-        self.tables = self.tables.reshape(self.C.shape[0], -1)
-
-    def _free(self, amplitude) -> Float[np.ndarray, "chunk output"]:
-        """Outputs of free vibration with the amplitudes (chunk, pole)."""
-        parts = np.concatenate([amplitude.real, -amplitude.imag], axis=1)
-        return product(parts, np.concatenate([self.C.real.T, self.C.imag.T]))
+        self.bound += product(size * np.where(slow, turn, 1.0), largest)
+        self.bound += forced_bend * half**2 / 8
+        self.bound += self.slack
+        self.tables = np.moveaxis(responses.table, 2, 0).ravel()
 
     def _place_forces(self):
         """Set the table positions of forces: `place` at t = 0 (points), `rate` (points/s)."""
@@ -334,27 +336,21 @@ class _Search:
         self.offset = panels.response * points + responses.first[panels.piece]
         self.last = count[panels.piece] - 2
 
-    def _forced(self, fraction: float) -> Float[np.ndarray, "chunk output"]:
-        """All outputs due to the forces at a fraction of each chunk, from the tables."""
-        table = self.responses.table.reshape(-1, self.C.shape[0])
-        times = (self.start + fraction * self.length)[:, None]
-        return self._from_table(table, self.panel, times)[:, 0]
+    def _from_table(self, table, panel, times, first, cubic: bool = False):
+        """Sums of the values of the forces in panels, at times (panel, time), from tables.
 
-    def _from_table(self, table, panel, times, cubic: bool = False):
-        """Sums of the table values of the forces in panels, at times (panel, time).
-
-        The table is interpolated linearly, or by cubics.
+        The tables, of each panel from its `first` row on, are interpolated linearly or by cubics.
         """
         width = times.shape[1] * (table.size // table.shape[0])
         if self._too_many(panel, width):
-            parts = _halves(panel, times)
+            parts = _halves(panel, times, first)
             return np.concatenate([self._from_table(table, *one, cubic=cubic) for one in parts])
         which, at = self.panels.forces_in(panel)
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
         last = self.last[at][:, None]
         low = np.clip(place.astype(int), int(cubic), last - int(cubic))
         fraction = np.clip(place, 0.0, last + 1) - low
-        low += self.offset[at][:, None]
+        low += (self.offset[at] + first[which])[:, None]
         if cubic:
             r = sum(w * table[low + i] for i, w in enumerate(_cubic_weights(fraction), start=-1))
             return _sums(self.panels.force[at][:, None] * r, which, panel.size)
@@ -371,57 +367,68 @@ class _Search:
 
     def peaks(self) -> tuple[Float[np.ndarray, "run output"], Float[np.ndarray, "run output"]]:
         """Peaks of the outputs in all runs, and their times (s)."""
-        steps = [self._steps_of_peak(output) for output in range(self.C.shape[0])]
-        output = np.repeat(np.arange(len(steps)), [step[0].size for step in steps])
-        return self._refined(output, *(np.concatenate(part) for part in zip(*steps, strict=True)))
+        return self._refined(*self._steps_of_peaks())
 
-    def _steps_of_peak(self, output: int):
-        """Panels, starts, lengths (s) and initial amplitudes of short steps that may have a peak.
+    def _steps_of_peaks(self):
+        """Outputs, panels, starts, lengths (s) and initial amplitudes of steps that may have peaks.
 
-        Each run has the peak of the output in one of these steps.
+        Each run has the peak of each output in one of these short steps.
         """
-        reached, bound = np.zeros(self.runs), self.bound[:, output]
-        _raise_to(reached, self.run, self.first[:, output])
+        outputs = self.C.shape[0]
+        reached = np.zeros((outputs, self.runs))
+        first = np.flatnonzero(np.diff(self.run, prepend=-1))
+        if first.size:
+            reached[:, self.run[first]] = np.maximum.reduceat(self.first, first, axis=0).T
         few = self.length * self.responses.system.fastest <= FEW_STEPS * self.phase
-        found = []
+        found, bound = [], self.bound.T
         for chunks, parts in ((~few, CHUNK_STEPS), (few, FEW_STEPS)):
-            chunk = np.flatnonzero(chunks & (bound >= reached[self.run]) & (bound > 0))
+            may_have = (bound >= reached[:, self.run]) & (bound > 0) & chunks
+            output, chunk = np.nonzero(may_have)
             own = self.panel[chunk], self.start[chunk], self.length[chunk], self.amplitude[chunk]
             bounds = self.bend[chunk, output], self.slack[chunk, output]
-            found.append(self._parts_of_steps(output, parts, reached, *own, *bounds))
+            found.append(self._parts_of_steps(reached.ravel(), parts, output, *own, *bounds))
         steps = [np.concatenate(part) for part in zip(*found, strict=True)]
-        order = np.argsort(self.panels.run[steps[0]], kind="stable")
+        order = np.argsort(self._number(steps[0], steps[1]), kind="stable")
         steps = [part[order] for part in steps]
         for _ in range(MAX_REFINEMENTS):
-            steps[-1] = self.cubic_slack[steps[0], output]
-            reached = np.zeros(self.runs)  # values of linear interpolation may be too high
-            steps = list(self._parts_of_steps(output, REFINEMENTS, reached, *steps, cubic=True))
-            if steps[0].size <= ENOUGH_STEPS * self.runs:
+            steps[-1] = self.cubic_slack[steps[1], steps[0]]
+            reached = np.zeros(outputs * self.runs)  # those of linear interpolation may be too high
+            steps = list(self._parts_of_steps(reached, REFINEMENTS, *steps, cubic=True))
+            if steps[0].size <= ENOUGH_STEPS * reached.size:
                 break
-        return steps[:4]
+        return steps[:5]
+
+    def _number(self, output, panel):
+        """Number of an output in the run of a panel, among all outputs in all runs."""
+        return output * self.runs + self.panels.run[panel]
 
     def _parts_of_steps(
-        self, output, parts, reached, panel, start, length, amplitude, bend, slack, cubic=False
+        self, reached, parts, output, panel, start, length, amplitude, bend, slack, cubic=False
     ):
-        """Panel, start, length, amplitude and bounds of parts of steps that may have the peak.
+        """Output, panel, start, length, amplitude and bounds of steps' parts that may have a peak.
 
         An output may exceed the largest value `reached` in its run there; `reached` is updated.
         """
+        if panel.size > 1 and panel.size * parts > MAX_VALUES:
+            halves = _halves(output, panel, start, length, amplitude, bend, slack)
+            found = [self._parts_of_steps(reached, parts, *half, cubic=cubic) for half in halves]
+            return [np.concatenate(part) for part in zip(*found, strict=True)]
         step = length / parts
         times = start[:, None] + step[:, None] * np.arange(parts + 1)
         values, growth = self._values(output, panel, amplitude, step, times, cubic)
-        run = self.panels.run[panel]
-        _raise_to(reached, run, values.max(axis=1))
+        number = self._number(output, panel)
+        _raise_to(reached, number, values.max(axis=1))
         above = bend * step**2 / 8 + slack
         limit = np.maximum(values[:, 1:], values[:, :-1]) + above[:, None]
-        which, part = np.nonzero(limit >= reached[run, None])
+        which, part = np.nonzero(limit >= reached[number, None])
         amplitude = amplitude[which] * growth[which] ** part[:, None]
-        parts_of = panel[which], times[which, part], step[which], amplitude
+        parts_of = output[which], panel[which], times[which, part], step[which], amplitude
         return *parts_of, bend[which], slack[which]
 
-    def _values(self, output: int, panel, amplitude, step, times, cubic: bool):
-        """Magnitudes of an output at equally spaced times; growth of free vibration in a step."""
-        values = self._from_table(self.tables[output], panel, times, cubic)
+    def _values(self, output, panel, amplitude, step, times, cubic: bool):
+        """Magnitudes of outputs at equally spaced times; growth of free vibration in a step."""
+        first = output * (self.tables.size // self.C.shape[0])
+        values = self._from_table(self.tables, panel, times, first, cubic)
         growth = np.exp(step[:, None] * self.poles)
         now = amplitude * self.C[output]
         for i in range(times.shape[1]):
@@ -435,7 +442,7 @@ class _Search:
         growth = np.exp(since[..., None] * self.poles)
         free = growth @ (amplitude * self.C[output])[..., None]
         samples = (free[..., 0].real + self._exact(output, panel, start[:, None] + since)).T
-        number = self.panels.run[panel] * self.C.shape[0] + output
+        number = self._number(output, panel)
         order = np.lexsort((estimate_peak(samples, PEAK_NODES), number))
         best = order[np.diff(number[order], append=-1) != 0]
         value, time = np.zeros((2, self.runs * self.C.shape[0]))
@@ -444,7 +451,8 @@ class _Search:
         finite = np.ones(self.runs, bool)
         finite[self.run[~np.isfinite(self.bound).all(axis=1)]] = False
         value, time = (
-            np.where(finite[:, None], part.reshape(self.runs, -1), np.nan) for part in (value, time)
+            np.where(finite[:, None], part.reshape(-1, self.runs).T, np.nan)
+            for part in (value, time)
         )
         return value, time
 
@@ -455,12 +463,42 @@ class _Search:
             return np.concatenate([self._exact(*one) for one in parts])
         panels, breaks = self.panels, self.responses.system.breaks
         which, at = panels.forces_in(panel)
-        piece = np.repeat(panels.piece[at], times.shape[1])
+        piece = panels.piece[at]
         x = panels.origin[at][:, None] + panels.speed[at][:, None] * times[which]
-        x = np.clip(x.reshape(-1), breaks[piece], breaks[piece + 1])
-        number, own = (np.repeat(a, times.shape[1]) for a in (panels.response[at], output[which]))
-        r = self.responses.exact(number, piece, x, own).reshape(-1, times.shape[1])
+        x = np.clip(x, breaks[piece, None], breaks[piece + 1, None])
+        r = self.responses.exact(panels.response[at], piece, x, output[which])
         return _sums(panels.force[at][:, None] * r, which, panel.size)
+
+
+def _free(amplitude, rows) -> Float[np.ndarray, "chunk output"]:
+    """Outputs of free vibration with the amplitudes (chunk, pole), by rows (output, pole)."""
+    parts = np.concatenate([amplitude.real, -amplitude.imag], axis=1)
+    return product(parts, np.concatenate([rows.real.T, rows.imag.T]))
+
+
+def _basis_of_outputs(system: ForceSystem):
+    """Indices of some outputs, and weights (basis, output) with which they add up to all.
+
+    Without static parts outputs are sums of modes, of which there are few.
+    """
+    # Imported here: it takes longer than most sweeps.
+    from scipy.linalg.interpolative import interp_decomp, reconstruct_interp_matrix
+
+    dynamic = np.flatnonzero(~system.has_static)
+    index, weights = np.arange(system.on_outputs.shape[0]), np.eye(system.on_outputs.shape[0])
+    if dynamic.size <= system.poles.size:
+        return index, weights
+    rows = system.on_outputs[dynamic]
+    parts = np.concatenate([rows.real, rows.imag], axis=1)
+    size = np.abs(parts).max(axis=1, keepdims=True)
+    size[size == 0] = 1.0
+    decomposed: Any = interp_decomp((parts / size).T, BASIS_ERROR, rand=False)
+    rank, order, others = decomposed
+    found = reconstruct_interp_matrix(order, others) * (size.T / size[order[:rank]])
+    index = np.append(dynamic[order[:rank]], np.flatnonzero(system.has_static))
+    weights = weights[index]
+    weights[:rank, dynamic] = found
+    return index, weights
 
 
 def _halves(*arrays):

@@ -181,19 +181,24 @@ class ForceResponses(NamedTuple):
     first: Int[np.ndarray, " piece"]
     count: Int[np.ndarray, " piece"]
 
-    def exact(self, speed, piece, x, output) -> Float[np.ndarray, " force"]:
-        """r(x) of an output for forces at x (m); `speed` and `piece` are indices of each force."""
+    def exact(self, speed, piece, x, output) -> Float[np.ndarray, "force time"]:
+        """r(x) of outputs for forces at x (force, time), in m.
+
+        `speed`, `piece` and `output` are indices of each force.
+        """
         segment = self.system.segment[piece]
-        series = self.on_outputs[speed, segment, :, output].T
-        t = _local(self.system.nodes, segment, x)
-        lower, value = 0.0, np.zeros(x.shape)
+        series = self.on_outputs[speed, segment, :, output].T[..., None]
+        t = _local(self.system.nodes, segment[:, None], x)
+        twice, lower, value = 2 * t, np.zeros(x.shape), np.zeros(x.shape)
         for coefficient in series[:0:-1]:  # Clenshaw's recurrence
-            lower, value = value, 2 * t * value - lower + coefficient
+            lower, value = value, twice * value - lower
+            value += coefficient
         value = t * value - lower + series[0]
-        has_static = np.flatnonzero(self.system.has_static[output])
-        if has_static.size:
-            own = (part[has_static] for part in (x, piece, output))
-            value[has_static] += self.system.static_part(*own)
+        own = np.flatnonzero(self.system.has_static[output])
+        if own.size:
+            of_each = (np.repeat(part[own], x.shape[1]) for part in (piece, output))
+            static = self.system.static_part(x[own].ravel(), *of_each)
+            value[own] += static.reshape(own.size, -1)
         return value
 
     def particular(self, speed: int, segment: int, x) -> Complex[np.ndarray, "force pole"]:

@@ -105,7 +105,8 @@ def test_the_bound_on_the_second_derivative_of_a_response():
 def test_no_peak_is_missed_among_random_forces():
     """Against dense samples of the same motion: they are below the peaks, and close to them."""
     rng, runs, wheels = np.random.default_rng(5), 12, 9
-    sensors = [jb.Sensor(x, name) for name in ("deflection", "velocity", "slope") for x in (2.5, 8)]
+    names, places = ("deflection", "velocity", "slope"), (1.0, 2.5, 6.0, 8.0)  # more than modes
+    sensors = [jb.Sensor(x, name) for name in names for x in places]
     system = system_of(dataclasses.replace(TWO_SPANS, sensors=sensors))
     speed = rng.choice([-40.0, -9.0, 7.0, 25.0, 110.0], (runs, wheels))
     origin = rng.uniform(-6, 18, (runs, wheels)) - speed * rng.uniform(0, 1, (runs, 1))
