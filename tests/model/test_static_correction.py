@@ -25,6 +25,7 @@ from jaxbeam.model.static_correction import (
     Motion,
     bending_moment,
     corrected_history,
+    is_supported,
     residual_flexibility,
     residual_port_flexibility,
     shear_force,
@@ -327,3 +328,31 @@ def test_correction_is_nearer_than_the_modes(shear_stiffness, rotary_inertia):
         of_modes, corrected = errors[modes, 0]
         assert np.all(4 * corrected < of_modes)
     assert np.max(errors[40, 0][1]) < 0.7 * np.max(errors[20, 0][1])
+
+
+@pytest.mark.parametrize(
+    ("ends", "hinges", "supports", "held"),
+    [
+        ("pinned-pinned", [], [], True),
+        ("clamped-free", [], [], True),
+        ("pinned-free", [], [jb.Support(0.7)], True),
+        ("pinned-free", [], [jb.Support(0.7, stiffness=1e3)], True),
+        ("clamped-pinned", [jb.Hinge(0.4)], [], True),
+        ("pinned-free", [], [], False),
+        ("free-free", [], [jb.Support(0.7)], False),
+        ("guided-free", [], [], False),
+        ("pinned-pinned", [jb.Hinge(0.4)], [], False),
+    ],
+)
+def test_a_traced_beam_is_held_by_the_kinds_of_its_supports(ends, hinges, supports, held):
+    """As counted by hand: two deflections, or one and a slope, and one more for each hinge."""
+    case = jb.Case(jb.Beam(1.0, 2.0, 0.5, ends=ends, hinges=hinges), supports)
+    found, layout = [], mesh_layout(case)
+
+    @jax.jit
+    def traced(rigidity):
+        found.append(is_supported(jb.replace(case, {"beam.flexural_rigidity": rigidity}), layout))
+        return rigidity
+
+    traced(2.0)
+    assert [*found, is_supported(case, layout)] == [held, held]

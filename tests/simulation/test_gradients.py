@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -439,3 +440,48 @@ def test_a_peak_at_the_end_moves_with_the_end_alone(case, address):
 
     expected = (peak(1e-6) - peak(-1e-6)) / (2e-6 * point)
     assert_allclose(slope, expected, rtol=1e-4, atol=1e-6 * float(value) / point)
+
+
+def test_derivatives_of_a_loop_that_bounces_between_its_limits_by_the_tangent():
+    """Motion is piecewise linear in a force; differences over 1e-4 of it leave the narrow pieces.
+
+    The motion is chaotic: its derivative grows to 2500 times that of a linear one in 0.4 s.
+    """
+    period, limit, force = 0.004, 3.0, 4.0
+    law = jb.LQR(state_weight=[1e6] * 2 + [1.0] * 2, command_weight=[1e-5], period=period)
+    case = jb.Case(
+        jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+        actuators=[jb.PointForce(0.25, limits=[-limit, limit])],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.VaryingForce(force=force, position=0.2)],
+        controller=law,
+        run=jb.Run(0.4, sample_rate=1 / period),
+    )
+    plant = jb.state_space(case)
+    system, gain = plant.at(0.0), law.law(plant).law.gain
+    held = scipy.signal.cont2discrete((system.A, system.B, system.C, 0 * system.D), period)
+    A, B, C = held[:3]
+    x, tangent, saturated, found = np.zeros(4), np.zeros(4), 0, []
+    for _ in range(101):
+        found.append((C[0] @ x, C[0] @ tangent))
+        wanted = -gain @ x
+        within = np.abs(wanted) < limit
+        saturated += int(not within.all())
+        command, slope = np.clip(wanted, -limit, limit), np.where(within, -gain @ tangent, 0.0)
+        x = A @ x + B @ np.append(command, force)
+        tangent = A @ tangent + B @ np.append(slope, 1.0)
+    largest, steepest = np.abs(found).max(axis=0)
+    assert saturated > 80 and force * steepest > 2000 * largest
+
+    def deflection(value):
+        changed = jb.replace(case, {"loads.0.force": value})
+        return jb.simulate(changed, tolerance=1e-8).deflection[:, 0]
+
+    motion, derivative = jax.jvp(deflection, (force,), (1.0,))
+    for ours, expected in zip((motion, derivative), np.transpose(found), strict=True):
+        assert_allclose(ours, expected, atol=1e-9 * np.abs(expected).max())
+    for step, near in ((1e-3, False), (1e-4, False), (1e-6, True)):
+        pair = deflection(force * (1 + step)), deflection(force * (1 - step))
+        difference = (pair[0] - pair[1]) / (2 * force * step)
+        off = np.abs(difference - derivative).max() / np.abs(derivative).max()
+        assert (off < 1e-4) if near else (off > 0.5)
