@@ -119,6 +119,26 @@ def _sweeps_in_xla():
         native_peaks.LIBRARY.remove()
 
 
+@pytest.fixture(scope="session")
+def native_cache(tmp_path_factory):
+    """A cache folder with the C integrator, compiled once for the tests of a process."""
+    from jaxbeam.integrator import native_peaks
+
+    folder = str(tmp_path_factory.mktemp("cache"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", folder)
+        native_peaks.LIBRARY.build()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def c_integrator(native_cache):
+    """The C integrator for a test file that asks for it; the others sweep without."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", native_cache)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _close_figures():
     """Close the figures of a test: matplotlib warns of many open ones, and warnings are errors."""
