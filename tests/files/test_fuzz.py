@@ -26,13 +26,15 @@ from tests.cli.example import CASE as SMALL
 from tests.files.test_case_file import FULL
 from tests.fuzzing import examples
 from tests.modules import ROOT
-from tests.strategies import ACTUATORS, actuators, sensors
-from tests.strategies.examples import (
+from tests.strategies import (
+    ACTUATORS,
     CONTROLLED,
     LOADS,
     PROFILES,
+    actuators,
     kinds_of_examples,
     kinds_of_jaxbeam,
+    sensors,
 )
 from tests.tuning.logs import test_readers as readers
 from tuning import read_logs

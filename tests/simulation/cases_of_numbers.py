@@ -13,7 +13,7 @@ from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.state_controller import DesignModel
 from tests.c_code.cases import LATE, PERIOD
 from tests.model.test_layered_track import RIG
-from tests.strategies.examples import CONTROLLED, LOADS, PROFILES
+from tests.strategies import CONTROLLED, LOADS, PROFILES
 
 RUN = jb.Run(0.3, sample_rate=217.3)  # no sample is at an event
 BEAM = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)

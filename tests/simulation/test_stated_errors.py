@@ -20,7 +20,7 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.loop_as_oracle import parts_of, span_of
 from tests.oracles.modal_equations import respond
 from tests.oracles.vehicle_elements import Car, quarter_cross
-from tests.strategies.examples import CONTROLLED, LOADS, PROFILES
+from tests.strategies import CONTROLLED, LOADS, PROFILES
 
 MAX_RATIO = 1.5  # of the true error over the stated one
 EXACT = 1e-11  # tolerance of the reference: a hundredth of the smallest below
