@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import Measurement

@@ -29,7 +29,7 @@ from jaxbeam.case.case import (
     value_at,
 )
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.former_words import attribute_address
+from jaxbeam.case.toml_file import attribute_address
 from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, xla_options

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxbeam.benchmark.problem import LOAD_STREAM, BenchmarkProblem
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.control.feedback import Feedback

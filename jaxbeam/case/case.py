@@ -30,12 +30,12 @@ from jaxbeam.case.fields import (
     is_real,
     number,
 )
-from jaxbeam.case.former_words import attribute_address, present_address
+from jaxbeam.case.former_words import present_address
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.case.loads.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.case.toml_file import in_si
+from jaxbeam.case.toml_file import attribute_address, in_si
 from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory
 from jaxbeam.runtime.arrays import Array, Module, Number, set_at, xp

@@ -1,14 +1,13 @@
-"""How parts of a case are shown: numbers with units, addresses in words, arguments explained."""
+"""How parts of a case are shown: numbers with units, addresses in words."""
 
 import dataclasses
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
-from jaxbeam.case.fields import in_unit, suggestion
+from jaxbeam.case.fields import ExplainsArguments
 from jaxbeam.runtime.arrays import Module
 from jaxbeam.runtime.printer import html_table
 
@@ -60,47 +59,6 @@ def with_prefix(value: float, unit: str, digits: int = 4) -> str:
     """A number with its unit, prefixed where it has one: "1.4 mm"; "0.0002" without unit."""
     scale = text_scale(value, unit)
     return f"{value / scale.factor:.{digits}g} {scale.unit}".rstrip()
-
-
-if TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
-    ExplainsArguments = type
-else:
-
-    class ExplainsArguments(type(eqx.Module)):
-        """Metaclass of parts whose errors of arguments say what each number is."""
-
-        def __call__(cls, *args, **arguments):
-            """Raises TypeError for arguments that are missing or unknown."""
-            try:
-                return super().__call__(*args, **arguments)
-            except TypeError:
-                explanation = _explanation(cls, args, arguments)
-                if explanation is None:
-                    raise
-            raise TypeError(explanation)
-
-
-def _explanation(part_class: type, args: tuple, arguments: dict) -> str | None:
-    """Sentence about the first unknown, or all missing arguments; None without any."""
-    fields = {field.name: field for field in dataclasses.fields(part_class) if field.init}
-    for name in arguments:
-        if name not in fields:
-            return f"{part_class.__name__} has no {name}; {suggestion(name, fields)}"
-    positional = [name for name, field in fields.items() if not field.kw_only]
-    given = {*positional[: len(args)], *arguments}
-    missing = [
-        f"{name}, the {field.metadata['meaning']}{in_unit(field)}"
-        for name, field in fields.items()
-        if name not in given and _is_required(field)
-    ]
-    if not missing:
-        return None
-    them = "it" if len(missing) == 1 else "them"
-    return f"{part_class.__name__} lacks {'; '.join(missing)}: give {them}"
-
-
-def _is_required(field: dataclasses.Field) -> bool:
-    return field.default is field.default_factory is dataclasses.MISSING
 
 
 MAX_VALUES = 6  # of a list that are written out

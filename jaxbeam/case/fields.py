@@ -16,7 +16,7 @@ import re
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from importlib.abc import InspectLoader
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -540,3 +540,44 @@ def _unit_suffix(field: dataclasses.Field) -> str:
 def in_unit(field: dataclasses.Field) -> str:
     """Unit of a field in words, such as " in N/m"; empty where it has none."""
     return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
+
+
+if TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
+    ExplainsArguments = type
+else:
+
+    class ExplainsArguments(type(eqx.Module)):
+        """Metaclass of parts whose errors of arguments say what each number is."""
+
+        def __call__(cls, *args, **arguments):
+            """Raises TypeError for arguments that are missing or unknown."""
+            try:
+                return super().__call__(*args, **arguments)
+            except TypeError:
+                explanation = _explanation(cls, args, arguments)
+                if explanation is None:
+                    raise
+            raise TypeError(explanation)
+
+
+def _explanation(part_class: type, args: tuple, arguments: dict) -> str | None:
+    """Sentence about the first unknown, or all missing arguments; None without any."""
+    fields = {field.name: field for field in dataclasses.fields(part_class) if field.init}
+    for name in arguments:
+        if name not in fields:
+            return f"{part_class.__name__} has no {name}; {suggestion(name, fields)}"
+    positional = [name for name, field in fields.items() if not field.kw_only]
+    given = {*positional[: len(args)], *arguments}
+    missing = [
+        f"{name}, the {field.metadata['meaning']}{in_unit(field)}"
+        for name, field in fields.items()
+        if name not in given and _is_required(field)
+    ]
+    if not missing:
+        return None
+    them = "it" if len(missing) == 1 else "them"
+    return f"{part_class.__name__} lacks {'; '.join(missing)}: give {them}"
+
+
+def _is_required(field: dataclasses.Field) -> bool:
+    return field.default is field.default_factory is dataclasses.MISSING

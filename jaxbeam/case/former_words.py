@@ -1,8 +1,5 @@
 """Words of former versions, which are refused by a sentence that names the present ones."""
 
-from collections.abc import Collection, Mapping
-from typing import Any
-
 NAMES = {  # of the package jaxbeam
     "Passage": "Feedforward",
     "Recognition": "LoadIdentification",
@@ -99,31 +96,6 @@ KINDS = {  # that are options of another kind
     "lqr-scheduled": ("lqr", 'horizon = "crossing" and schedule = "load"'),
     "lqr-position": ("lqr", 'horizon = "crossing" and schedule = "positions"'),
 }
-# Words of case files that attributes in Python cannot have, and those that they have; both stay.
-FILE_KEYS = {"class": "road_class", "heights": "point_heights"}
-
-
-def with_attribute_names(
-    address: str, table: Mapping[str, Any], allowed: Collection[str]
-) -> dict[str, Any]:
-    """A table of a case file with its keys as they are called in Python.
-
-    A word that is among the allowed keys is left alone. Raises ValueError if both words are there.
-    """
-    values = {}
-    for key, value in table.items():
-        new = key if key in allowed else FILE_KEYS.get(key, key)
-        if new not in allowed:
-            new = key
-        if new != key and new in table:
-            raise ValueError(f"{address}.{key} is called {new} in Python; leave one of them out")
-        values[new] = value
-    return values
-
-
-def attribute_address(address: str) -> str:
-    """An address in a case with the words of attributes in Python."""
-    return ".".join(FILE_KEYS.get(name, name) for name in address.split("."))
 
 
 def present_address(address: str) -> str:

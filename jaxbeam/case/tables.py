@@ -22,9 +22,8 @@ from jaxbeam.case.fields import (
     missing_error,
     suggestion,
 )
-from jaxbeam.case.former_words import with_attribute_names
 from jaxbeam.case.sensors import unit_of
-from jaxbeam.case.toml_file import check_entries, check_length, in_si
+from jaxbeam.case.toml_file import check_entries, check_length, in_si, with_attribute_names
 
 # Words of what is not in the model of a beam; the nearest key would be another thing.
 OUTSIDE = re.compile(r"skew|torsion|twist|eccentric|frame|grillage")

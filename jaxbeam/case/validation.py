@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
-from jaxbeam.case.actuators.base import AbstractActuator
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import AbstractActuator, limited_loops
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support, has
 from jaxbeam.case.case import Case, check_is_case, list_sizes, parts
 from jaxbeam.case.contact import ONE_RUN, AbstractContact

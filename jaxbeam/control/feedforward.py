@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import (
     AbstractController,

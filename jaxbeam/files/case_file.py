@@ -28,11 +28,10 @@ from jaxbeam.case.case import (
 )
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, kind_of, kinds, refuses_traced, suggestion
-from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.loads.vehicles import IMPLIED, is_path
 from jaxbeam.case.profiles.shapes import TableProfile
 from jaxbeam.case.tables import read_part, read_parts
-from jaxbeam.case.toml_file import read_toml
+from jaxbeam.case.toml_file import attribute_address, read_toml
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.input_file import read_text_input

@@ -14,9 +14,8 @@ from jaxbeam.case.fields import (
     describe_shape,
     kinds,
 )
-from jaxbeam.case.former_words import FILE_KEYS
 from jaxbeam.case.profiles.shapes import TableProfile
-from jaxbeam.case.toml_file import MAX_COUNTS
+from jaxbeam.case.toml_file import FILE_KEYS, MAX_COUNTS
 
 
 class Key(NamedTuple):

@@ -102,7 +102,7 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
     """
     pairs = []
     for i, actuator in enumerate(case.actuators):
-        if accepts_commands(actuator):
+        if actuator.accepts_commands:
             pairs += [(f"actuators.{i}", f"sensors.{j}") for j in range(len(case.sensors))]
         if isinstance(actuator, Electrodynamic):
             pairs += shaker_channels(i)
@@ -207,7 +207,7 @@ def _input_unit(case: Case, channel: str) -> str:
         _check_position(case, channel, position)
         return "N"
     actuator, actuator_input = _parse_actuator(case, channel, "input")
-    if not accepts_commands(actuator):
+    if not actuator.accepts_commands:
         raise ValueError(f"the input {channel!r} takes no command")
     if actuator_input not in ("", "active_force"):
         raise ValueError(
@@ -266,11 +266,6 @@ def _check_position(case: Case, channel: str, position: str) -> None:
     except ValueError:
         raise ValueError(f"{channel!r}: {position!r} is not a number in m") from None
     check_on_beam(repr(channel), x, case.beam.length)
-
-
-def accepts_commands(actuator: AbstractActuator) -> bool:
-    """Whether an actuator accepts commands; a passive one does not."""
-    return actuator.command_unit != "1"
 
 
 def _force_unit(actuator: AbstractActuator) -> str:

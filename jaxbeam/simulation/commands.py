@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import NODE_COUNT

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.profiles.spectra import AbstractSpectralProfile

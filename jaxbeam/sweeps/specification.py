@@ -29,10 +29,9 @@ from jaxbeam.case.case import (
 )
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import QUANTITIES, Sensor
-from jaxbeam.case.toml_file import in_si
+from jaxbeam.case.toml_file import attribute_address, in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks

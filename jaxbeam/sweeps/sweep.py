@@ -20,9 +20,8 @@ import numpy as np
 
 from jaxbeam.case.case import ALL, Case, address_words, addresses, unit_at
 from jaxbeam.case.fields import OUTSIDE, refuses_traced
-from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.profiles.spectra import profiles_of_runs
-from jaxbeam.case.toml_file import in_si
+from jaxbeam.case.toml_file import attribute_address, in_si
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible_sweep
 from jaxbeam.runtime.interrupts import keeping

@@ -94,11 +94,6 @@ _SPELLINGS = {
 }
 
 
-def time_derivative(quantity: str) -> int:
-    """Order of a quantity as a time derivative: 1 for velocity, 2 for acceleration, else 0."""
-    return QUANTITIES[quantity].time_derivative if quantity in QUANTITIES else 0
-
-
 def unit(text: str) -> Unit:
     """Unit by the name in a log, such as `mm`, `µm`, `m/s²` or `g`.
 

@@ -25,7 +25,6 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.runtime.output_file import check_ending, whole_file
 from tuning.logs.log import Log
 from tuning.logs.quality import sensor_readings
-from tuning.logs.units import time_derivative
 from tuning.modal.ambient import MAX_BAND_RATIO, Candidate, subspace_modes
 from tuning.modal.decay.excitation import impacts_left_out
 from tuning.modal.decay.modes import Decays, find_excited, free_decay_modes, modes_of_decays
@@ -53,6 +52,7 @@ from tuning.modal.preprocessing import (
     kinetic_band,
     prepare,
     samples_of,
+    time_derivative,
     with_channels,
     without_constant,
 )

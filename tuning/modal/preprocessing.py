@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.ndimage import percentile_filter
 from scipy.signal import butter, detrend, find_peaks, firwin, resample_poly, sosfiltfilt, welch
 
+from jaxbeam.case.sensors import QUANTITIES
 from tuning.logs.log import Log, even_records
 from tuning.logs.quality import find_faults
 
@@ -381,3 +382,8 @@ def _sample_range(log: Log, window) -> tuple[int, int]:
         )
     start, stop = np.searchsorted(log.times, window)
     return int(start), int(stop)
+
+
+def time_derivative(quantity: str) -> int:
+    """Order of a quantity as a time derivative: 1 for velocity, 2 for acceleration, else 0."""
+    return QUANTITIES[quantity].time_derivative if quantity in QUANTITIES else 0

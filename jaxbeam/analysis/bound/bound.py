@@ -31,7 +31,7 @@ import scipy  # loads its parts on first use; all of them take a third of a seco
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxbeam.case.actuators.electrodynamic import limited_loops
+from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.case import Case, check_is_case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import check_on_beam, concrete, real_numbers, refuses_traced
@@ -49,7 +49,6 @@ from jaxbeam.integrator.time_grid import (
     grid_by_schedule,
     grid_by_step_length,
 )
-from jaxbeam.model.frequency_responses import accepts_commands
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, Module, take, xp
@@ -610,7 +609,7 @@ def checked_influence(
     positions = _checked_positions(case, positions)
     if not case.actuators:
         raise ValueError("a bound needs actuators, and the case has none; add one")
-    if not any(map(accepts_commands, case.actuators)):
+    if not any(actuator.accepts_commands for actuator in case.actuators):
         raise ValueError(
             f"actuators: none of the {len(case.actuators)} takes commands; add one that does"
         )

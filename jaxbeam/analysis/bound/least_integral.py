@@ -18,7 +18,6 @@ from jaxbeam.analysis.bound.bound import InputInfluence, checked_influence, held
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.control.feedforward import Prescribed
-from jaxbeam.model.frequency_responses import accepts_commands
 from jaxbeam.numerics.qp import STATUS_TEXT, solve_qp
 from jaxbeam.runtime.arrays import Module
 from jaxbeam.simulation.record import Record
@@ -107,7 +106,7 @@ def least_integral(
         )
     low, high, change = held_command_limits(case, period)
     for i, actuator in enumerate(case.actuators):
-        if accepts_commands(actuator) and not np.all(np.isfinite([low[i], high[i]])):
+        if actuator.accepts_commands and not np.all(np.isfinite([low[i], high[i]])):
             raise ValueError(f"actuators.{i}.limits must be given: the criterion bounds the input")
     H, f, constant = _quadratic(influence, given)
     commands = _solve(H, f, low, high, change, influence.response.shape[2:])

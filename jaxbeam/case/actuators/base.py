@@ -5,6 +5,7 @@ and piezoelectric macro-fibre patches bonded to it, in 33 mode.
 """
 
 import abc
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -113,6 +114,16 @@ class AbstractActuator(ReprWithUnits, Module):
         """SI unit of the command, V or N; "1" for a passive device, which takes none."""
         return type(self).__dataclass_fields__["limits"].metadata["unit"]
 
+    @property
+    def accepts_commands(self) -> bool:
+        """Whether it accepts commands; a passive device does not."""
+        return self.command_unit != "1"
+
+    @property
+    def has_limited_loop(self) -> bool:
+        """Whether it is a shaker whose voltage has limits within an inner loop."""
+        return False
+
     def command_limits(self) -> Float[Array, "2"] | None:
         """Smallest and largest command, in the unit of the command; None if unlimited."""
         return self.limits
@@ -124,6 +135,11 @@ class AbstractActuator(ReprWithUnits, Module):
     def command_rate_limit(self) -> Float[Array, ""] | None:
         """Largest rate of change of the command, per second; None if unlimited."""
         return None
+
+
+def limited_loops(actuators: Sequence[AbstractActuator]) -> tuple[int, ...]:
+    """Indices of the shakers whose voltage has limits within an inner loop."""
+    return tuple(i for i, actuator in enumerate(actuators) if actuator.has_limited_loop)
 
 
 class PointForce(AbstractActuator):

@@ -12,7 +12,6 @@ tracking time of the integral action; Åström and Hägglund 2006, section 3.5).
 """
 
 import abc
-from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -342,6 +341,11 @@ class Electrodynamic(AbstractActuator):
     def command_unit(self) -> str:
         return "V" if self.inner_loop is None else self.inner_loop.command_unit
 
+    @property
+    def has_limited_loop(self) -> bool:
+        """Whether its voltage has limits within an inner loop."""
+        return self.inner_loop is not None and self.limits is not None
+
     def command_limits(self) -> Float[Array, "2"] | None:
         return self.limits if self.inner_loop is None else self.inner_loop.limits
 
@@ -358,14 +362,3 @@ class Electrodynamic(AbstractActuator):
                 f" {address}.mass at once"
             )
         return None
-
-
-def limited_loops(actuators: Sequence[AbstractActuator]) -> tuple[int, ...]:
-    """Indices of the shakers whose voltage has limits within an inner loop."""
-    return tuple(
-        i
-        for i, actuator in enumerate(actuators)
-        if isinstance(actuator, Electrodynamic)
-        and actuator.inner_loop is not None
-        and actuator.limits is not None
-    )
