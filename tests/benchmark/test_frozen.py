@@ -134,7 +134,9 @@ def test_bounds_are_found_again(name):
     assert_allclose(found.uncontrolled, stored.uncontrolled, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["unknown_mass", "late_sensor", "footbridge"])
+@pytest.mark.parametrize(
+    "name", ["unknown_mass", "late_sensor", "footbridge", "patch", "saturated"]
+)
 def test_baselines_have_the_stored_scores(name):
     seeds = TEST_SEEDS[:2]
     found, stored = jb.benchmark.score(name, seed=seeds), jb.benchmark.baselines()[name]
