@@ -31,6 +31,7 @@ from jaxbeam.c_code.translation import (
     last_word,
     named_arrays,
     operations,
+    sharing_memory,
     with_numbers,
     without_unused,
 )
@@ -519,7 +520,8 @@ def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
     renew(writer, kept, after, None)
     writer.line("/* Commands */")
     writer.copy(CArray("d", (actuators,), "commands", False), sent)
-    body = "\n".join(writer.lines)
+    lines, stack_bytes = sharing_memory(writer.lines)
+    body = "\n".join(lines)
     notes = []
     if jax.tree.structure(program.law.law) != jax.tree.structure(law):
         notes = [f"Tables over time end after {samples} samples; then their last entries hold."]
@@ -543,7 +545,7 @@ def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
         len(gate_times_of(law)),
         received,
         operations(closed.jaxpr),
-        writer.stack_bytes,
+        stack_bytes,
         notes,
         [part.without_reading for part in _parts(law) if hasattr(part, "without_reading")],
         min(getattr(part, "difference_step", 1.0) for part in _parts(law)),

@@ -96,7 +96,6 @@ class ProgramWriter(Translation):
         self.constants: dict[str, np.ndarray] = {}
         self.last_place: str | None = None
         self.used_once: set = set()
-        self.stack_bytes = 0
 
     def line(self, text: str) -> None:
         """Write a line, or several of at most WIDTH characters, with the types of a program."""
@@ -109,11 +108,6 @@ class ProgramWriter(Translation):
             break_long_words=False,
             break_on_hyphens=False,
         )
-
-    def declare(self, kind: str, shape: Sequence[int], varying: bool) -> CArray:
-        """New array on the stack."""
-        self.stack_bytes += math.prod(shape) * (8 if kind == "d" else 4)
-        return super().declare(kind, shape, varying)
 
     def constant(self, array: np.ndarray) -> CArray:
         """Constant array of some numbers; arrays of equal numbers are stored once."""
@@ -237,6 +231,57 @@ def fingerprint(array) -> tuple:
     """Hashable key of the kind, size and numbers of an array."""
     array = np.asarray(array)
     return array.dtype.kind, array.size, array.tobytes()
+
+
+DECLARATION = re.compile(r"^( *)(real|int) (v\d+)\[(\d+)\];$")
+OWN_PLACE = 16  # entries: up to so many an array is one of its own, which may be in registers
+BYTES = {"real": 8, "int": 4}
+
+
+def sharing_memory(lines: Sequence[str]) -> tuple[list[str], int]:
+    """Lines of a function whose large arrays share memory where no two are used at a time.
+
+    Also the bytes of all arrays in double precision. An array is used from its declaration to the
+    last line with its name, or to the end of the block within the block of its declaration that
+    this line is in, as the block may be a loop.
+    """
+    last_use: dict[str, int] = {}
+    opened: list[int] = []  # lines that open the blocks around the present one
+    closed: dict[int, int] = {}  # line that closes a block, by the line that opens it
+    around: list[tuple[int, ...]] = []
+    for number, line in enumerate(lines):
+        around.append(tuple(opened))
+        for sign in re.findall(r"[{}]", line):
+            if sign == "{":
+                opened.append(number)
+            else:
+                closed[opened.pop()] = number
+        last_use |= dict.fromkeys(re.findall(r"\bv\d+\b", line), number)
+    declared, sizes = [], {"real": 0, "int": 0}
+    for number, line in enumerate(lines):
+        if found := DECLARATION.match(line):
+            indent, kind, name, size = *found.groups()[:3], int(found[4])
+            end, depth = last_use[name], len(around[number])
+            if len(around[end]) > depth:
+                end = closed[around[end][depth]]
+            declared.append((number, end, indent, kind, name, size))
+    lines, own, placed = list(lines), 0, []
+    for number, end, indent, kind, name, size in declared:
+        if size <= OWN_PLACE:
+            own += size * BYTES[kind]
+            continue
+        present = [one for one in placed if one[0] == kind and one[1] >= number]
+        starts = sorted([0, *(start + length for _, _, start, length in present)])
+        free = next(
+            start
+            for start in starts
+            if all(start >= a + n or start + size <= a for _, _, a, n in present)
+        )
+        placed.append((kind, end, free, size))
+        sizes[kind] = max(sizes[kind], free + size)
+        lines[number] = f"{indent}{kind} *const {name} = {kind}_memory + {free};"
+    memory = [f"    {kind} {kind}_memory[{size}];" for kind, size in sizes.items() if size]
+    return memory + lines, own + sum(BYTES[kind] * size for kind, size in sizes.items())
 
 
 def _place(equation) -> str | None:

@@ -1,5 +1,6 @@
 """Functions of JAX as C99 for one run, under strict compilers: their numbers, and their cost."""
 
+import re
 import shutil
 import subprocess
 
@@ -16,6 +17,7 @@ from jaxbeam.c_code.translation import (
     functions_of,
     named_arrays,
     operations,
+    sharing_memory,
     without_unused,
 )
 from jaxbeam.numerics.qp import solve_qp
@@ -159,3 +161,44 @@ def test_a_loop_needs_a_largest_number_of_turns():
 
     with pytest.raises(UntranslatedError, match="a loop without a largest number of turns"):
         operations(jax.make_jaxpr(halved)(np.ones(4)).jaxpr)
+
+
+def test_arrays_share_memory_where_no_two_are_used_at_a_time():
+    """The first is free after its last line; the third lives until the loop that reads it ends."""
+    text = """
+    real v1[100];
+    fill(v1);
+    real v2[50];
+    copy(v2, v1);
+    real v3[80];
+    copy(v3, v2);
+    real v4[4];
+    for (int i = 0; i < 9; i++) {
+        real v5[60];
+        copy(v5, v3);
+        real v6[70];
+        copy(v6, v5);
+    }
+    int v7[200];
+    real v8[90];
+    copy(v8, v4);
+    """
+    lines, size = sharing_memory(text.strip("\n").split("\n"))
+    places = {}
+    for line in lines:
+        if "_memory +" in line:
+            kind, name, first = re.fullmatch(
+                r" *(\w+) \*const (v\d) = \w+ \+ (\d+);", line
+            ).groups()
+            places[name] = kind, int(first)
+    assert places == {
+        "v1": ("real", 0),
+        "v2": ("real", 100),
+        "v3": ("real", 0),
+        "v5": ("real", 80),
+        "v6": ("real", 140),
+        "v7": ("int", 0),
+        "v8": ("real", 0),
+    }
+    assert lines[:2] == ["    real real_memory[210];", "    int int_memory[200];"]
+    assert "    real v4[4];" in lines and size == 8 * (210 + 4) + 4 * 200
