@@ -18,8 +18,8 @@ PACKAGES = ("jaxbeam", "tuning", "experiments", "tests")
 SETUP = """
 import dataclasses
 import jaxbeam as jb, tuning
-rig = jb.load_case("jaxbeam/demo/rig.toml")
-log = tuning.read_log("jaxbeam/demo/log_1.csv")
+rig = jb.load_case("jaxbeam/case/library/demo/rig.toml")
+log = tuning.read_log("jaxbeam/case/library/demo/log_1.csv")
 strip = jb.load_case("examples/controlled_rig/case.toml")
 case = dataclasses.replace(strip, controller=None)
 loads = tuning.LoadCases(({"loads.0.mass": 0.25},), ({"loads.0.mass": 0.4},))

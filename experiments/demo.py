@@ -6,9 +6,9 @@ A rig is identified from three logged crossings, swept over loads of other masse
 given a controller whose gains are tuned by gradients, beside the hand-set gains and the least
 achievable peak.
 
-The logs are in `jaxbeam/demo`; they were made by the finite elements of `tests/oracles`, not by
-jaxbeam, with noise and offsets, and the start values in the case file beside them are wrong. The
-true values are known, and the fit is compared with them.
+The logs are in `jaxbeam/case/library/demo`; they were made by the finite elements of
+`tests/oracles`, not by jaxbeam, with noise and offsets, and the start values in the case file
+beside them are wrong. The true values are known, and the fit is compared with them.
 """
 
 import dataclasses
@@ -56,7 +56,7 @@ def run(folder: str | Path | None = None, json: bool = False) -> None:
         if not json:
             print(text, flush=True)
 
-    with resources.as_file(resources.files("jaxbeam") / "demo") as data:
+    with resources.as_file(resources.files("jaxbeam.case.library") / "demo") as data:
         case = jb.load_case(data / "rig.toml")
         logs = [tuning.read_log(data / name) for name in LOGS]
         truth = tomllib.loads((data / "truth.toml").read_text())

@@ -33,6 +33,10 @@ from .case.sensors import Filter as Filter, Sensor as Sensor
 from .case.track import Track as Track
 from .control import receptance_method as receptance_method
 from .control.compensators import PD as PD, PositivePositionFeedback as PositivePositionFeedback
+from .control.estimation.inversion import Inversion as Inversion
+from .control.estimation.kalman import ExtendedKalman as ExtendedKalman, Kalman as Kalman
+from .control.estimation.moving_horizon import MovingHorizon as MovingHorizon
+from .control.estimation.observer import Observer as Observer
 from .control.feedback import (
     Feedback as Feedback,
     OutputFeedback as OutputFeedback,
@@ -52,10 +56,6 @@ from .control.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.semi_active import SemiActive as SemiActive
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_controller import StateFeedback as StateFeedback
-from .estimation.inversion import Inversion as Inversion
-from .estimation.kalman import ExtendedKalman as ExtendedKalman, Kalman as Kalman
-from .estimation.moving_horizon import MovingHorizon as MovingHorizon
-from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.tables import save as save
 from .model import frequency_responses as frequency_responses, statics as statics
@@ -67,6 +67,6 @@ from .simulation.record import Record as Record, Result as Result
 from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
 from .simulation.stored_record import read_record as read_record
-from .sweeps.sweep import sweep as sweep
+from .simulation.sweeps.sweep import sweep as sweep
 
 __version__: str

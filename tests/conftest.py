@@ -114,7 +114,7 @@ def _sweeps_in_xla():
 
     Tests of it have cache folders of their own.
     """
-    native_peaks = sys.modules.get("jaxbeam.integrator.native_peaks")
+    native_peaks = sys.modules.get("jaxbeam.simulation.integrator.native_peaks")
     if native_peaks:
         native_peaks.LIBRARY.remove()
 
@@ -122,7 +122,7 @@ def _sweeps_in_xla():
 @pytest.fixture(scope="session")
 def native_cache(tmp_path_factory):
     """A cache folder with the C integrator, compiled once for the tests of a process."""
-    from jaxbeam.integrator import native_peaks
+    from jaxbeam.simulation.integrator import native_peaks
 
     folder = str(tmp_path_factory.mktemp("cache"))
     with pytest.MonkeyPatch.context() as patch:

@@ -17,7 +17,7 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import kind_of, kinds
 from jaxbeam.case.loads.base import MovingForce, MovingMass
 from jaxbeam.case.sensors import QUANTITIES, Filter, Sensor
-from tests.c_code import cases as controlled
+from tests.export import cases as controlled
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:

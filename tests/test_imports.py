@@ -13,15 +13,15 @@ from tests.modules import PACKAGES, ROOT, module_files, parse
 # no longer name here covers. One import may point down: methods of results that are called `plot`
 # or `plot_...` forward to `jaxbeam.plot`.
 ORDER = """
-jaxbeam.runtime  jaxbeam.library
+jaxbeam.runtime  jaxbeam.case.library
 jaxbeam.case
 jaxbeam.numerics
 jaxbeam.model
-jaxbeam.integrator  jaxbeam.estimation
+jaxbeam.simulation.integrator  jaxbeam.control.estimation
 jaxbeam.control
 jaxbeam.files
-jaxbeam.rigs  jaxbeam.simulation
-jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
+jaxbeam.case.library.rigs  jaxbeam.simulation
+jaxbeam.simulation.sweeps  jaxbeam.export
 jaxbeam.analysis
 jaxbeam.plot  jaxbeam.benchmark
 jaxbeam  jaxbeam.api
@@ -36,7 +36,7 @@ experiments.thesis  experiments.demo
 experiments.studies
 experiments.benchmarks
 experiments.validation  experiments
-jaxbeam.app
+jaxbeam.cli.page
 jaxbeam.cli
 jaxbeam.__main__
 """
@@ -136,7 +136,7 @@ def test_no_circles():
 
 def test_violations_and_circles_are_found():
     assert violations({"jaxbeam.case.beam": {"jaxbeam.model.modes"}})
-    assert violations({"jaxbeam.control.lqr": {"jaxbeam.sweeps.sweep"}})
+    assert violations({"jaxbeam.control.lqr": {"jaxbeam.simulation.sweeps.sweep"}})
     assert not violations({"jaxbeam.model.modes": {"jaxbeam.case.beam"}})
     code = "if TYPE_CHECKING:\n    from jaxbeam.model.modes import Modes\n"
     assert {name for name, _ in imported(ast.parse(code), FILES)} == {"jaxbeam.model.modes"}
@@ -149,7 +149,7 @@ def test_only_methods_called_plot_may_forward_to_figures():
         ("plot", "jaxbeam.plot", set()),
         ("plot_envelope", "jaxbeam.plot", set()),
         ("draw", "jaxbeam.plot", {"jaxbeam.plot.__init__"}),
-        ("plot", "jaxbeam.sweeps", {"jaxbeam.sweeps.__init__"}),
+        ("plot", "jaxbeam.simulation.sweeps", {"jaxbeam.simulation.sweeps.__init__"}),
     ):
         tree = ast.parse(code.format(name, package_name))
         assert {module for module, _ in imported(tree, FILES)} == found

@@ -19,10 +19,6 @@ from jaxbeam.analysis.bound.bound import run_peaks
 from jaxbeam.analysis.stability import frozen_poles, growth, stream
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.sensors import QUANTITIES, Filter
-from jaxbeam.integrator.discrete_model import discrete_model, propagators
-from jaxbeam.integrator.integrate import max_stable_step
-from jaxbeam.integrator.step_size import static_shapes
-from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.flexibility import flexibility
@@ -33,6 +29,10 @@ from jaxbeam.model.output_rows import sensor_rows
 from jaxbeam.runtime.arrays import any_jax, xp
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, xla_options
 from jaxbeam.simulation.integration_plan import integration_plan, sample_times
+from jaxbeam.simulation.integrator.discrete_model import discrete_model, propagators
+from jaxbeam.simulation.integrator.integrate import max_stable_step
+from jaxbeam.simulation.integrator.step_size import static_shapes
+from jaxbeam.simulation.integrator.time_grid import grid_by_step_length
 
 TOLERANCE = 1e-11  # relative to the largest entry of each array
 # Where a curve is flat, its values differ by the square of a difference in time.

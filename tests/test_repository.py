@@ -19,6 +19,7 @@ from tests.layers.selection import layers, matches
 from tests.layers.touched import nearest_tests
 from tests.modules import ROOT, module_files, parse
 from tests.mutants.__main__ import first_fit, left_ones, patterns, targets
+from tests.test_imports import package
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SPANS = re.findall(r"`([^`]+)`", TEXT)
@@ -198,9 +199,11 @@ def test_targets_name_files_and_tests_that_exist():
     files = [path.relative_to(ROOT).as_posix() for path in (ROOT / "jaxbeam").rglob("*.py")]
     fits = {name: first_fit(name) for name in files}
     assert {*no_numbers, *tests} == {*fits.values()} - {None}
-    mutated = {name.split("/")[1] for name in targets()}
-    assert mutated == {"model", "case", "integrator", "estimation", "analysis", "simulation"}
-    assert not [n for n in files if fits[n] is None and n.split("/")[1] in mutated]
+    rooms = {name: package(name.removesuffix(".py").replace("/", ".")) for name in files}
+    mutated = {rooms[name] for name in targets()}
+    words = "model case control.estimation analysis simulation simulation.integrator"
+    assert mutated == {f"jaxbeam.{word}" for word in [*words.split(), "simulation.sweeps"]}
+    assert not [n for n in files if fits[n] is None and rooms[n] in mutated]
     for test in sorted({test for own in tests.values() for test in own}):
         path, _, name = test.partition("::")
         assert (ROOT / path).exists(), test

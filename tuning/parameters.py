@@ -30,10 +30,10 @@ from jaxbeam.case.case import (
 )
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.toml_file import attribute_address
-from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, xla_options
 from jaxbeam.simulation.integration_plan import IntegrationPlan
+from jaxbeam.simulation.integrator.time_grid import EventSchedule
 from jaxbeam.simulation.simulate import simulate_readings
 
 SCALES = ("linear", "log", "logit")

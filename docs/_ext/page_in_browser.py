@@ -1,6 +1,6 @@
 """The page without a server, in the folder `app` of the site: its files, and the library as a zip.
 
-`jaxbeam/app/static/worker.js` loads Python as WebAssembly and the library into it.
+`jaxbeam/cli/page/static/worker.js` loads Python as WebAssembly and the library into it.
 """
 
 import shutil
@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-STATIC = ROOT / "jaxbeam" / "app" / "static"
+STATIC = ROOT / "jaxbeam" / "cli" / "page" / "static"
 ENDINGS = {".py", ".pyi", ".toml", ".csv", ".json"}
 MARK = '<meta name="jaxbeam-worker" content="static/worker.js">'
 

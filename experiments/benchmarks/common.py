@@ -19,8 +19,8 @@ import jax
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.printer import markdown_table
+from jaxbeam.simulation.integrator import native_peaks
 
 SLOWEST, FASTEST = 0.3, 10.0  # m/s, of the crossings of sweeps
 COMPILED_RUNS = 4096  # runs of the sweep by which everything is compiled

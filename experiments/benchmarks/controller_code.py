@@ -19,10 +19,10 @@ from typing import NamedTuple
 import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
 from experiments.benchmarks.controller_steps import CONTROLLERS, MODES, PERIOD, patch_case
-from jaxbeam.c_code import CProgram, export_c, write_c
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import kinds
 from jaxbeam.control.sampled_lqr import SamplingWarning
+from jaxbeam.export import CProgram, export_c, write_c
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 LOST = 0.05  # of the readings

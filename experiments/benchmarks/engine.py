@@ -21,8 +21,8 @@ import numpy as np
 import jaxbeam as jb
 from experiments.benchmarks import trains
 from experiments.benchmarks.common import one_span_case, parser
-from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
+from jaxbeam.simulation.integrator import native_peaks
 
 ROOT = pathlib.Path(__file__).parents[2]
 MASS, RIGIDITY, SPEED = "loads.0.mass", "beam.flexural_rigidity", "loads.0.speed"

@@ -190,7 +190,7 @@ RECORD = ("simulate", "{case}", "-o", "run.nc", "--plot", "--overwrite")
 DEMO = """
 import tomllib, tuning
 from importlib import resources
-data = resources.files("jaxbeam") / "demo"
+data = resources.files("jaxbeam.case.library") / "demo"
 case, truth = jb.load_case(data / "rig.toml"), tomllib.loads((data / "truth.toml").read_text())
 logs = [tuning.read_log(data / f"log_{i}.csv") for i in (1, 2, 3)]
 """

@@ -28,7 +28,7 @@ from experiments.benchmarks.common import (
     sweep_grid,
     without_native,
 )
-from jaxbeam.sweeps.sweep import sweep
+from jaxbeam.simulation.sweeps.sweep import sweep
 
 
 def measure(runs: int, native: bool = False) -> dict[str, float]:

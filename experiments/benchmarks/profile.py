@@ -28,7 +28,7 @@ from experiments.benchmarks.common import (
     without_native,
 )
 from experiments.benchmarks.sweep import sweep_peaks
-from jaxbeam.sweeps.integration import integrate_block
+from jaxbeam.simulation.sweeps.integration import integrate_block
 
 STAGES = (
     "modes",

@@ -38,10 +38,10 @@ from experiments.benchmarks.common import (
 )
 from experiments.benchmarks.rivals import baselines, numba_peaks
 from experiments.benchmarks.rivals.baselines import PinnedBeam
-from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.integrator import native_peaks
 from jaxbeam.simulation.simulate import simulate_readings
 
 MASSES = np.linspace(0.1, 1.0, 64)

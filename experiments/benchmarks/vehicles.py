@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
-from jaxbeam.integrator import native_peaks
+from jaxbeam.simulation.integrator import native_peaks
 
 LENGTH, RIGIDITY, MASS, DAMPING, MODES = 25.0, 3.05e10, 15000.0, 0.01, 5
 GRAVITY, DURATION, FREE = 9.81, 1.6, 0.3  # the script stops so long (s) after the exit

@@ -27,7 +27,7 @@ from experiments.studies.held_out import PERIOD, held_out_loads
 from experiments.studies.sensor_feedback import bench_case, drawn_table, with_cutoff
 from experiments.studies.tuned_feedforward import COMMAND_RESOLUTION, MODES
 from experiments.thesis.cases import with_modes
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import markdown_table
 from jaxbeam.simulation.simulate import ContactLossWarning

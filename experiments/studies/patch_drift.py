@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 import jaxbeam as jb
 import tuning
-from jaxbeam import rigs
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
+from jaxbeam.case.library import rigs
 from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.simulation.commands import command_operator
 from tuning.fit.hysteresis import (

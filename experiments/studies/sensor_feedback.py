@@ -50,9 +50,9 @@ from experiments.studies.held_out import (
 from experiments.studies.tuned_feedforward import COMMAND_LIMITS, COMMAND_RESOLUTION, MODES
 from experiments.thesis.cases import with_feedback, with_modes
 from experiments.thesis.verdicts import Experiment, ExperimentResult
-from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case
+from jaxbeam.case.library import rigs
 from jaxbeam.model.modes import mesh_layout
 from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import run_case

@@ -48,7 +48,7 @@ from experiments.studies.held_out import (
 )
 from experiments.thesis.cases import with_feedback, with_modes
 from experiments.thesis.verdicts import Experiment, ExperimentResult
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 
 FOLDER = Path(__file__).parent / "controllers" / "feedforward"
 LEAD = 0.005  # s: half of the sampling period, the mean delay of a held command

@@ -25,7 +25,7 @@ from experiments.thesis.verdicts import (
     assign_verdicts,
     reading_name,
 )
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 from jaxbeam.files.report import check_report_folder, write_report
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file

@@ -410,7 +410,7 @@ class Experiment:
     """One table or group of figures of the thesis: its subject, its claim, and its computation.
 
     `run(load_rig)` computes the result; `load_rig(name)` returns the case of a published rig, as
-    `jaxbeam.rigs.load` does.
+    `jaxbeam.case.library.rigs.load` does.
     """
 
     name: str

@@ -28,10 +28,10 @@ import scipy.signal
 import scipy.sparse
 
 import jaxbeam as jb
-from jaxbeam import rigs
 from jaxbeam.analysis.bound.bound import Bound, input_influence
+from jaxbeam.case.library import rigs
 from jaxbeam.case.sensors import filter_history, second_order_sections, steady_filter_state
-from jaxbeam.estimation.observer import kalman_gain, sampled_kalman_gain
+from jaxbeam.control.estimation.observer import kalman_gain, sampled_kalman_gain
 from jaxbeam.files.report import ReportSection, ReportTable, markdown
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.integration_plan import integration_plan

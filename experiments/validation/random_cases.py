@@ -40,9 +40,9 @@ from jaxtyping import Float
 
 import jaxbeam as jb
 from experiments.benchmarks.common import print_row, print_table
-from jaxbeam.integrator.step_size import UNSAMPLED
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan
+from jaxbeam.simulation.integrator.step_size import UNSAMPLED
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations

@@ -44,9 +44,9 @@ from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.base import MovingMass
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.estimation.crossing_filter import CrossingFilter, FilterState, SampleModel
+from jaxbeam.control.estimation.observer import sampled_kalman_gain
 from jaxbeam.control.state_controller import SampledStateLaw
-from jaxbeam.estimation.crossing_filter import CrossingFilter, FilterState, SampleModel
-from jaxbeam.estimation.observer import sampled_kalman_gain
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Signal, StateSpace, state_space

@@ -1,6 +1,6 @@
 """Envelopes of the load models of road bridges: a vehicle at its worst place, and a lane load.
 
-Models are those of `jaxbeam/library/load_models.toml`; a new one is a table there.
+Models are those of `jaxbeam/case/library/load_models.toml`; a new one is a table there.
 """
 
 import dataclasses
@@ -12,11 +12,11 @@ from jaxtyping import Float
 from jaxbeam.analysis.sections import Envelope, envelope
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import check_on_beam, concrete, refuses_traced, suggestion
+from jaxbeam.case.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import quantity_of
 from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.track import Kernel
-from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections
 from jaxbeam.model.elements import held_positions
 from jaxbeam.model.modes import modes

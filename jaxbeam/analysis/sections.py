@@ -28,7 +28,6 @@ from jaxbeam.case.fields import (
     suggestion,
 )
 from jaxbeam.case.sensors import QUANTITIES, Sensor, quantity_of
-from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.model.along_beam import (
     LEFT_DISTANCE,
     moving_positions,
@@ -44,6 +43,7 @@ from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.integrator.integrate import integrate_peaks
 from jaxbeam.simulation.record import Record, envelope_headline, with_unit
 from jaxbeam.simulation.simulate import integration_setup, run_integration
 

@@ -32,8 +32,8 @@ from jaxbeam.analysis.linearised_loop import (
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.control.estimation.kalman import Kalman
 from jaxbeam.control.mpc import MPC
-from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.stages import propagate
 from jaxbeam.runtime.arrays import ravel_pytree, scan, to_numpy, xp

@@ -20,18 +20,18 @@ from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.arguments import checks_classes
 from jaxbeam.case.case import Case
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
-from jaxbeam.integrator.integrate import step_inputs
-from jaxbeam.integrator.load_path import load_path
-from jaxbeam.integrator.step import AffineMap, step_maps
-from jaxbeam.integrator.step_size import StaticShapes
-from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule
-from jaxbeam.integrator.vehicles import vehicles_of
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Module
 from jaxbeam.simulation.closed_loop import LoopMemory, SampledLoop, closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times
+from jaxbeam.simulation.integrator.discrete_model import NODE_COUNT, discrete_model
+from jaxbeam.simulation.integrator.integrate import step_inputs
+from jaxbeam.simulation.integrator.load_path import load_path
+from jaxbeam.simulation.integrator.step import AffineMap, step_maps
+from jaxbeam.simulation.integrator.step_size import StaticShapes
+from jaxbeam.simulation.integrator.time_grid import EventSchedule, grid_by_schedule
+from jaxbeam.simulation.integrator.vehicles import vehicles_of
 from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan
 
 TOLERANCE = 1e-9  # of the steps, relative to the largest deflection

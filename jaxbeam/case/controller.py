@@ -5,7 +5,7 @@ measurements into commands: at samples, or in continuous time. Controllers are i
 
 An estimator holds the settings of a case file. For a plant it designs a filter, which turns
 readings into an estimate of the state, at samples or in continuous time, for a law that feeds back
-the state. Estimators are in `jaxbeam.estimation`.
+the state. Estimators are in `jaxbeam.control.estimation`.
 """
 
 import abc
@@ -324,7 +324,7 @@ class AbstractContinuousFilter(Module):
 class AbstractEstimator(ReprWithUnits, Module, metaclass=ExplainsArguments):
     """Estimate of the state from readings, at the samples of a controller, and its settings.
 
-    To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.
+    To add one, write a file in `jaxbeam.control.estimation` with a subclass that names its `kind`.
     """
 
     kind: ClassVar[str]
@@ -347,7 +347,7 @@ class AbstractEstimator(ReprWithUnits, Module, metaclass=ExplainsArguments):
     def sampled_filter(self, plant: Any, timing: Any) -> AbstractSampledFilter:
         """Filter at samples, designed for a `jaxbeam.model.state_space.Plant`.
 
-        `timing` is the `jaxbeam.estimation.sampled_plant.SampleTiming` of the controller.
+        `timing` is the `jaxbeam.control.estimation.sampled_plant.SampleTiming` of the controller.
         """
 
     def continuous_filter(self, plant: Any) -> AbstractContinuousFilter:

@@ -253,7 +253,7 @@ def concrete(
     return np.asarray(value, float)
 
 
-PACKAGES = ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation")  # with parts of cases
+PACKAGES = ("jaxbeam.case", "jaxbeam.control")  # with parts of cases
 _DECLARATION = re.compile(r'^    kind: ClassVar\[str\] = "(.+)"', re.MULTILINE)
 
 

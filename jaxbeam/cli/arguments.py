@@ -112,7 +112,7 @@ def _range_values(text: str, value: str) -> list[Any]:
         )
     import numpy as np
 
-    from jaxbeam.sweeps import MAX_VALUES
+    from jaxbeam.simulation.sweeps import MAX_VALUES
 
     if count > MAX_VALUES:
         raise UsageError(f"--over {text}: a range may have {MAX_VALUES:.0e} values, no more")

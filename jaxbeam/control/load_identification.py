@@ -20,8 +20,8 @@ from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, deciding, is_concrete, number
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.trajectory import SAME_FRACTION, has_come
-from jaxbeam.estimation.observability import deflection_outputs
-from jaxbeam.estimation.observer import sensor_offsets
+from jaxbeam.control.estimation.observability import deflection_outputs
+from jaxbeam.control.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
 from jaxbeam.runtime.arrays import Array, Module, Number, scan, take, xp

@@ -38,10 +38,10 @@ from jaxbeam.control.crossing_gains import (
     frozen_gains,
     with_single_mass,
 )
+from jaxbeam.control.estimation.sampled_plant import sample_timing
 from jaxbeam.control.load_identification import LoadIdentification, given_load, identification_error
 from jaxbeam.control.sampled_lqr import IntegralLaw, sampled_gain, warn_slow_sampling
 from jaxbeam.control.state_controller import AbstractStateController, GainLaw, deflection_rows
-from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import GainTable, boundary_layer
 from jaxbeam.numerics.riccati import lqr

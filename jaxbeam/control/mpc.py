@@ -26,6 +26,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
+from jaxbeam.control.estimation.sampled_plant import in_blocks
 from jaxbeam.control.prediction import (
     Prediction,
     Preview,
@@ -50,7 +51,6 @@ from jaxbeam.control.state_controller import (
     AbstractStateLaw,
     deflection_rows,
 )
-from jaxbeam.estimation.sampled_plant import in_blocks
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.qp import METHODS, QuadraticProgram, first_move
 from jaxbeam.runtime.arrays import Array, Number, add_at, set_at, take, xp

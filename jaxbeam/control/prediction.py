@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.control.crossing_gains import crossing_plant
-from jaxbeam.estimation.sampled_plant import step_count
+from jaxbeam.control.estimation.sampled_plant import step_count
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import MAX_HALVINGS
 from jaxbeam.numerics.riccati import dare, dlqr

@@ -26,8 +26,8 @@ from jaxbeam.case.controller import (
     Time,
 )
 from jaxbeam.case.fields import NOT_NEGATIVE, choice, concrete, count, is_concrete, number, part
-from jaxbeam.estimation.crossing_filter import ContinuousWithVehicles, SampledWithVehicles
-from jaxbeam.estimation.sampled_plant import sample_timing
+from jaxbeam.control.estimation.crossing_filter import ContinuousWithVehicles, SampledWithVehicles
+from jaxbeam.control.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.output_rows import modal_row

@@ -1,7 +1,7 @@
 """Cases as TOML files and as plain dictionaries, both ways; measured profiles in files of values.
 
 Keys follow from the fields of the classes, kinds from the classes that declare one in a module of
-`jaxbeam.case`, `jaxbeam.control` or `jaxbeam.estimation`: nothing is registered here.
+`jaxbeam.case`, `jaxbeam.control` or `jaxbeam.control.estimation`: nothing is registered here.
 """
 
 import copy

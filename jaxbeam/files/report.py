@@ -179,7 +179,7 @@ def interactive_page(title: str, sentence: str, columns: Mapping[str, Any]) -> s
 
 def page_of(title: str, sentence: str, scripts: Sequence[str], data: Mapping, show: str) -> str:
     """HTML page of data (DATA), shown by the JavaScript `show` and by scripts of `jaxbeam app`."""
-    folder = resources.files("jaxbeam") / "app" / "static"
+    folder = resources.files("jaxbeam.cli.page") / "static"
     texts = [(folder / name).read_text(encoding="utf-8") for name in scripts]
     modules = re.sub(r"^import .*$|^export ", "", "\n".join(texts), flags=re.MULTILINE)
     # A name may hold "</script>", which would end the script.

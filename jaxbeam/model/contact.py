@@ -25,7 +25,7 @@ The profile and forces that vary in time add to W and q what `prescribed_disturb
 Where a wheel with mass passes a kink, the slope of its path jumps: that of a beam at a hinge and,
 if it is flexible in shear, where the shear force or the shear stiffness does; that of a profile at
 the ends of a ramp. A wheel that stays on the surface then changes its velocity by |v| ([w'] + [r'])
-at once, from left to right; see `jaxbeam.integrator.step_matrices.with_impulses`.
+at once, from left to right; see `jaxbeam.simulation.integrator.step_matrices.with_impulses`.
 """
 
 import math

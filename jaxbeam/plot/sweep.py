@@ -47,7 +47,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
-from jaxbeam.sweeps.realisations import CONFIDENCE, realisations
+from jaxbeam.simulation.sweeps.realisations import CONFIDENCE, realisations
 
 FAST = 20.0  # m/s: from here on speeds are in km/h
 MAX_ORDER = 4  # of marked resonances and cancellations; higher ones are weak
@@ -505,7 +505,7 @@ def plot_realisations(
     Lines mark the mean and the fractile of a level, a band the interval of the fractile, dotted
     red ones `limits` by quantity (SI units). All other addresses of the sweep must have one value.
     The title is that of the case if left out; `labels` name the sensors. Raises ValueError as
-    `jaxbeam.sweeps.realisations.realisations`, and for further addresses with several values.
+    `realisations`, and for further addresses with several values.
     """
     found = realisations(dataset, address, level)
     case = case_from_dict(json.loads(dataset.attrs["case"]))

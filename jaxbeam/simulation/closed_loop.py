@@ -19,14 +19,6 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.fields import concrete
-from jaxbeam.integrator.discrete_model import GAUSS_NODES, NODE_COUNT
-from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo, load_amplitude
-from jaxbeam.integrator.time_grid import (
-    EventSchedule,
-    Transmission,
-    controller_schedule,
-    moving_with_end,
-)
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
@@ -65,6 +57,14 @@ from jaxbeam.simulation.commands import (
     command_path,
     limit_commands,
     with_missing_voltages,
+)
+from jaxbeam.simulation.integrator.discrete_model import GAUSS_NODES, NODE_COUNT
+from jaxbeam.simulation.integrator.inputs import AbstractInputPolicy, StepInfo, load_amplitude
+from jaxbeam.simulation.integrator.time_grid import (
+    EventSchedule,
+    Transmission,
+    controller_schedule,
+    moving_with_end,
 )
 
 SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from jaxbeam.case.actuators.base import limited_loops
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.discrete_model import NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensor_signals import ROUNDED
 from jaxbeam.numerics.polynomials import lagrange_weights
@@ -30,6 +29,7 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
+from jaxbeam.simulation.integrator.discrete_model import NODE_COUNT
 
 CommandRanges = tuple[Float[Array, " actuator"], ...]
 

@@ -8,9 +8,6 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import QUANTITIES, TWIST, Sensor, quantity_of
-from jaxbeam.integrator.discrete_model import PEAK_NODES
-from jaxbeam.integrator.peaks import Peaks, RunningPeaks
-from jaxbeam.integrator.step_size import UNSAMPLED, StepTrial, trial_positions
 from jaxbeam.model.elements import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
@@ -18,6 +15,9 @@ from jaxbeam.model.modes import Modes
 from jaxbeam.model.output_rows import band_weights, place_of, sensor_history, sensor_row
 from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
+from jaxbeam.simulation.integrator.discrete_model import PEAK_NODES
+from jaxbeam.simulation.integrator.peaks import Peaks, RunningPeaks
+from jaxbeam.simulation.integrator.step_size import UNSAMPLED, StepTrial, trial_positions
 from jaxbeam.simulation.section_forces import motion_at
 
 

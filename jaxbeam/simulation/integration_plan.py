@@ -22,10 +22,17 @@ from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete, is_concrete, real_numbers
 from jaxbeam.case.toml_file import MAX_SAMPLED, MAX_SAMPLES
 from jaxbeam.case.validation import check_case
-from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.inputs import AbstractInputPolicy, HeldCommands
-from jaxbeam.integrator.integrate import integrate_at_events
-from jaxbeam.integrator.step_size import (
+from jaxbeam.model.elements import largest_layout
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.simulation.closed_loop import closed_loop, loop_of_case, loop_schedule, moves_events
+from jaxbeam.simulation.errors import step_errors
+from jaxbeam.simulation.integrator.discrete_model import discrete_model
+from jaxbeam.simulation.integrator.inputs import AbstractInputPolicy, HeldCommands
+from jaxbeam.simulation.integrator.integrate import integrate_at_events
+from jaxbeam.simulation.integrator.step_size import (
     CONVERGENCE_ORDER,
     MAX_DIVERGED_HALVINGS,
     NO_STEP,
@@ -43,14 +50,7 @@ from jaxbeam.integrator.step_size import (
     static_shapes,
     steps_per_interval,
 )
-from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule
-from jaxbeam.model.elements import largest_layout
-from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modal_model import modal_model
-from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
-from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.simulation.closed_loop import closed_loop, loop_of_case, loop_schedule, moves_events
-from jaxbeam.simulation.errors import step_errors
+from jaxbeam.simulation.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule
 
 # Errors of a plan, relative to the largest deflection, beyond which it is not followed by a case of
 # other numbers. They grow with the ninth power, at least, of steps over the stability limit.

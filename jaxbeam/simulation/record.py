@@ -240,20 +240,20 @@ class Record(RecordViews):
     Loads are counted by their wheels. `load_position` (m) is NaN while a wheel is off the beam,
     `contact_force` (N, positive under compression) zero, unless it is the wheel of a vehicle, which
     presses on the ground. `smallest` and `largest` values of the quantities of the sensors are in
-    their units. The `bodies` of vehicles have displacements in m (or rad) from static
-    equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
+    their units. The `bodies` of vehicles have displacements in m (or rad) from static equilibrium,
+    positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
     model allows; NaN without one. On rough profiles `lowest_contact_force` (N) is within 2e-4 of
     the largest contact force, which the error estimates do not hold. With unilateral contact they
     are those of the first flight, and `flights` are all of them, else None. `command` is that of
     the actuators, within their limits; at a change, the one just after. `failures` counts the steps
     of the controller so far without a solution of its optimisation. If the closed loop diverges,
-    which its growth shows (see `jaxbeam.integrator.inputs`), the samples are NaN from then on, and
-    so are the peaks. `error_estimate`, of steps and peaks, is relative to the largest deflection,
-    `step_errors` to the largest value of what each sensor measures; both have no derivatives, which
-    `grad` refuses and `jvp` gives as NaN. `controller_readings` are the readings that a sampled
-    controller has received, None without one; `acting_command` are the commands behind hysteresis
-    and creep of the actuators, None if no actuator has any. `peak_stroke` (m) and
+    which its growth shows (see `jaxbeam.simulation.integrator.inputs`), the samples are NaN from
+    then on, and so are the peaks. `error_estimate`, of steps and peaks, is relative to the largest
+    deflection, `step_errors` to the largest value of what each sensor measures; both have no
+    derivatives, which `grad` refuses and `jvp` gives as NaN. `controller_readings` are the readings
+    that a sampled controller has received, None without one; `acting_command` are the commands
+    behind hysteresis and creep of the actuators, None if no actuator has any. `peak_stroke` (m) and
     `peak_absorber_force` (N) are the largest absolute ones of each absorber. `result` is zero, or
     the sum of what is wrong with the run (see `Result`).
 

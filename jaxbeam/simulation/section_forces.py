@@ -13,14 +13,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import SIDES, SLOPE, quantity_of
-from jaxbeam.integrator.force_peaks import (
-    ForcePaths,
-    constant_speeds,
-    force_panels,
-    force_paths,
-    force_wheels,
-)
-from jaxbeam.integrator.force_system import ForceSystem, force_responses, force_system
 from jaxbeam.model.contact import ContactState, contact_at, split_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -36,6 +28,14 @@ from jaxbeam.model.sensor_signals import VehicleMotion
 from jaxbeam.model.static_correction import Motion, corrected_history, port_forces
 from jaxbeam.model.transfer_matrices import has_settlement, settled_beam
 from jaxbeam.runtime.arrays import Array, add_at, xp
+from jaxbeam.simulation.integrator.force_peaks import (
+    ForcePaths,
+    constant_speeds,
+    force_panels,
+    force_paths,
+    force_wheels,
+)
+from jaxbeam.simulation.integrator.force_system import ForceSystem, force_responses, force_system
 
 
 def outputs_of_forces(

@@ -16,18 +16,6 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import all_concrete, concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
-from jaxbeam.integrator.discrete_model import (
-    NODE_COUNT,
-    PEAK_NODES,
-    DiscreteModel,
-    discrete_model,
-    end_weights,
-    signed_both_ways,
-)
-from jaxbeam.integrator.inputs import AbstractInputPolicy
-from jaxbeam.integrator.integrate import integrate_history, peaks_of_halves
-from jaxbeam.integrator.peaks import Peaks, RunningPeaks
-from jaxbeam.integrator.time_grid import TimeGrid, event_places, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.output_rows import (
@@ -75,6 +63,18 @@ from jaxbeam.simulation.integration_plan import (
     sample_times,
     times_of_samples,
 )
+from jaxbeam.simulation.integrator.discrete_model import (
+    NODE_COUNT,
+    PEAK_NODES,
+    DiscreteModel,
+    discrete_model,
+    end_weights,
+    signed_both_ways,
+)
+from jaxbeam.simulation.integrator.inputs import AbstractInputPolicy
+from jaxbeam.simulation.integrator.integrate import integrate_history, peaks_of_halves
+from jaxbeam.simulation.integrator.peaks import Peaks, RunningPeaks
+from jaxbeam.simulation.integrator.time_grid import TimeGrid, event_places, grid_by_schedule
 from jaxbeam.simulation.record import Record, Result
 from jaxbeam.simulation.section_forces import motion_at
 from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxbeam.case.case import Case, check_is_case, replace
 from jaxbeam.case.fields import concrete, is_concrete, real_numbers
-from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.runtime.arrays import Module, any_traced, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
+from jaxbeam.simulation.integrator.step_size import check_tolerance
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import plan_of_peaks, simulate_planned
 from jaxbeam.simulation.varied_plan import Range, declared_ranges, varied_plan, within

@@ -1,7 +1,7 @@
 """Integration with unilateral contact: wheels lift where they would have to pull, fly, and land.
 
 Between these events the set of wheels that press is fixed; steps are those of
-`jaxbeam.integrator.lifting_steps`. An event is the zero of a contact force (or of the compression
+`integrator.lifting_steps`. An event is the zero of a contact force (or of the compression
 of a spring of contact), or of the gap between a wheel in flight and the surface. A step that has
 one inside is cut there, by the state at its end. Landing, and where the velocity of the surface
 jumps under a rigid wheel, impulses follow from the law of `jaxbeam.case.contact`. A surface that
@@ -22,7 +22,14 @@ from jaxbeam.case.contact import UnilateralContact
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.lifting_steps import (
+from jaxbeam.model.contact import ContactState, initial_vehicle_states, split_states
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.output_rows import sensor_history
+from jaxbeam.model.sensor_signals import VehicleMotion, relative_to_beam
+from jaxbeam.model.static_correction import Motion
+from jaxbeam.simulation.integration_plan import IntegrationPlan
+from jaxbeam.simulation.integrator.lifting_steps import (
     INSIDE,
     NODE_COUNT,
     NODES,
@@ -36,7 +43,7 @@ from jaxbeam.integrator.lifting_steps import (
     instants,
     prepare,
 )
-from jaxbeam.integrator.peaks import (
+from jaxbeam.simulation.integrator.peaks import (
     FORCE_FRACTIONS,
     FORCE_WEIGHTS,
     RunningPeaks,
@@ -44,15 +51,8 @@ from jaxbeam.integrator.peaks import (
     initial_peaks,
     peaks_of_steps,
 )
-from jaxbeam.integrator.step_size import UNSAMPLED, rounding_deflection, trial_positions
-from jaxbeam.integrator.time_grid import TimeGrid
-from jaxbeam.model.contact import ContactState, initial_vehicle_states, split_states
-from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.output_rows import sensor_history
-from jaxbeam.model.sensor_signals import VehicleMotion, relative_to_beam
-from jaxbeam.model.static_correction import Motion
-from jaxbeam.simulation.integration_plan import IntegrationPlan
+from jaxbeam.simulation.integrator.step_size import UNSAMPLED, rounding_deflection, trial_positions
+from jaxbeam.simulation.integrator.time_grid import TimeGrid
 from jaxbeam.simulation.section_forces import motion_of
 from jaxbeam.simulation.views import Flights
 

@@ -24,7 +24,7 @@ from jaxbeam.analysis.assessment.checks import (
     train_response,
 )
 from jaxbeam.analysis.sections import characteristic_points
-from jaxbeam.library.published import trains
+from jaxbeam.case.library.published import trains
 from jaxbeam.model.output_rows import counted_frequency
 from tests.modules import ROOT
 

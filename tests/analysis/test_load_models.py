@@ -15,8 +15,8 @@ from jaxbeam.analysis.load_models import (
     load_model,
     load_model_envelope,
 )
+from jaxbeam.case.library.published import LoadModel, ModelVehicle, load_models
 from jaxbeam.cli import main
-from jaxbeam.library.published import LoadModel, ModelVehicle, load_models
 from tests.modules import ROOT
 
 PYCBA = json.loads((ROOT / "tests" / "data" / "load_models.json").read_text())

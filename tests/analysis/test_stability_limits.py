@@ -23,8 +23,8 @@ from jaxbeam.analysis.stability import (
     stream,
     stream_excess,
 )
+from jaxbeam.case.library.rigs import load
 from jaxbeam.cli import main
-from jaxbeam.rigs import load
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import (

@@ -18,8 +18,8 @@ import jaxbeam as jb
 from jaxbeam.benchmark import scoring
 from jaxbeam.benchmark.problem import TEST_SEEDS, VERSION, load, names
 from jaxbeam.benchmark.scoring import attainable, compute_attainable, published
-from jaxbeam.integrator.step_size import static_shapes
 from jaxbeam.simulation.commands import command_ranges
+from jaxbeam.simulation.integrator.step_size import static_shapes
 from tests.modules import ROOT
 
 # Of all that v1 is. Numbers under it are cited: what must change is a new version beside it.

@@ -18,7 +18,7 @@ from jaxbeam.analysis.bound.bound import held_command_limits
 from jaxbeam.analysis.sections import coil_history
 from jaxbeam.case.case import addresses, replace
 from jaxbeam.case.validation import check_case
-from jaxbeam.fmi import BeamSteps
+from jaxbeam.export.fmi import BeamSteps
 from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.simulation.commands import acting_ranges, command_operator, with_exact_compensation
 from jaxbeam.simulation.integration_plan import integration_plan

@@ -117,7 +117,7 @@ def test_parts_of_a_case_follow_from_its_fields():
 
 @pytest.mark.parametrize("key", ["actuators", "loads", "profile", "controller"])
 def test_every_class_of_a_case_has_a_kind(key):
-    import_modules("jaxbeam.c_code")  # has a private member of a family
+    import_modules("jaxbeam.export")  # has a private member of a family
     family = part_classes()[key].part_class
     found = {each for each in kinds(family).values() if each.__module__.startswith("jaxbeam.")}
     assert all(find_kind(family, kind) is each for kind, each in kinds(family).items())
@@ -368,7 +368,7 @@ TUNING = """
 import jaxbeam as jb, tuning
 case, loads = jb.load_case("examples/controlled_rig/case.toml"), {"loads.0.mass": 0.25}
 free, loads = {"controller.gains.0": None}, tuning.LoadCases((loads,))
-log = tuning.read_log("jaxbeam/demo/log_1.csv")
+log = tuning.read_log("jaxbeam/case/library/demo/log_1.csv")
 objective = "objective takes a tuning.Objective or None, not a function; a function of your own"
 a_log = "logs takes a tuning.Log or a list of tuning.Log, not"
 of_a_word = [
@@ -408,8 +408,8 @@ from importlib import import_module
 import jaxbeam, tuning
 from jaxbeam.case.arguments import fits
 
-OTHERS = ("c_code", "fmi", "files.export", "plot", "benchmark", "rigs")
-PARTS = ("jaxbeam.case.", "jaxbeam.control.", "jaxbeam.estimation.", "tuning.control.")  # of cases
+OTHERS = ("export", "plot", "benchmark", "case.library.rigs")
+PARTS = ("jaxbeam.case.", "jaxbeam.control.", "tuning.control.")  # of cases
 FITTING = {int: 1, bool: False, str: "x"}
 modules = [jaxbeam, tuning, *(import_module(f"jaxbeam.{name}") for name in OTHERS)]
 modules += [one for m in modules[:2] for n in m.__all__ if inspect.ismodule(one := getattr(m, n))]

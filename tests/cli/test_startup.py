@@ -9,7 +9,7 @@ import pytest
 
 from jaxbeam.cli.app import COMMANDS, app, main
 from jaxbeam.cli.commands.export import GAIN_FILES
-from jaxbeam.files.export import WRITERS
+from jaxbeam.export import WRITERS
 
 HEAVY = ("jax", "numpy", "scipy", "equinox", "matplotlib", "xarray", "tuning", "experiments")
 
@@ -58,7 +58,7 @@ def test_nothing_heavy_is_imported(folder, line):
 
 def test_a_record_and_a_picture_need_no_package_that_takes_as_long_as_the_run(folder):
     slow = ("xarray", "pandas", "dask", "scipy.signal", "scipy.optimize", "matplotlib.pyplot")
-    slow += ("jaxbeam.control.mpc", "jaxbeam.estimation.kalman")  # kinds of no part
+    slow += ("jaxbeam.control.mpc", "jaxbeam.control.estimation.kalman")  # kinds of no part
     code = (
         "import json, sys\n"
         "from jaxbeam.cli import main\n"

@@ -24,15 +24,15 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
 from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.integrator import native_peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, sample_times, static_shapes
-from jaxbeam.sweeps.computation import FailedRunsWarning
-from tests.c_code.cases import CASES
+from jaxbeam.simulation.integrator import native_peaks
+from jaxbeam.simulation.sweeps.computation import FailedRunsWarning
 from tests.differences import central
+from tests.export.cases import CASES
 from tests.loop_as_oracle import expected
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=2)

@@ -16,8 +16,8 @@ import jaxbeam as jb
 from jaxbeam.analysis.bound.least_integral import least_integral
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import DesignModel
-from jaxbeam.files.export.designed import export_gains
-from tests.c_code.cases import CASES, rig as passive_rig
+from jaxbeam.export.gains import export_gains
+from tests.export.cases import CASES, rig as passive_rig
 
 POLES = [-12.80978306539895 + 127.45573222133082j, -30.743479356957476 + 511.46818666380324j]
 OPEN = -5.12391323 + 512.365702j

@@ -32,7 +32,7 @@ from experiments.thesis.verdicts import (
     make_finding,
     readings_of,
 )
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 from jaxbeam.cli import main
 from tests.tuning import make_rig_logs
 

@@ -28,10 +28,10 @@ from experiments.studies.patch_drift import (
 )
 from experiments.studies.tuned_feedforward import COMMAND_LIMITS
 from experiments.thesis.cases import data_physics_v4
-from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case
 from jaxbeam.case.controller import Measurement
+from jaxbeam.case.library import rigs
 from jaxbeam.control.internal_model import REFERENCE, VALUES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.commands import command_operator

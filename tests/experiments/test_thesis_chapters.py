@@ -45,10 +45,10 @@ from experiments.thesis.chapter6.gain_scheduling import (
     scheduled_controller,
 )
 from experiments.thesis.verdicts import LITERAL, STATEMENT, assign_verdicts
-from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.library import rigs
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
 from tests.control.test_feedback import beam_case, gains_at, law

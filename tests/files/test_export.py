@@ -22,7 +22,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.lqr import LQR
-from jaxbeam.files.export import Gains, export_gains, read_gains, write_gains
+from jaxbeam.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.model.modes import mesh_layout
 
 RANDOM = np.random.default_rng(0)

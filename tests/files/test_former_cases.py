@@ -22,12 +22,12 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.estimation.sampled_plant import SampleTiming
+from jaxbeam.control.estimation.sampled_plant import SampleTiming
+from jaxbeam.export import export_gains, read_gains
+from jaxbeam.export.gains import ARRAYS
 from jaxbeam.files.case_file import KindChangeWarning, with_settings
-from jaxbeam.files.export import export_gains, read_gains
-from jaxbeam.files.export.designed import ARRAYS
 from jaxbeam.simulation.stored_record import read_record
-from tests.c_code.cases import CASES as LOOPS, rig
+from tests.export.cases import CASES as LOOPS, rig
 from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 from tuning import load_fit, read_logs
 

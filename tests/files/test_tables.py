@@ -292,7 +292,7 @@ def test_names_of_sensors_come_back_from_files(tmp_path, name, ending):
 
 
 def test_gains_hold_no_formulas():
-    from jaxbeam.files.export.files import _csv_cell
+    from jaxbeam.export.gain_files import _csv_cell
 
     assert _csv_cell("=K") == "'=K"
 

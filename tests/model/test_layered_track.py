@@ -162,7 +162,7 @@ def rig(load, modes=12, **changes) -> jb.Case:
     return jb.Case(jb.Beam(0.6, 11.68, 0.535, 0.03, modes=modes), **(parts | changes))
 
 
-@pytest.mark.filterwarnings("ignore::jaxbeam.sweeps.computation.TruncationWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.sweeps.computation.TruncationWarning")
 @pytest.mark.parametrize(
     "load",
     [jb.MovingForce(force=3.0, speed=2.4), jb.Oscillator(0.3, 300.0, 0.5, 0.02, speed=2.4)],

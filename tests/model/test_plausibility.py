@@ -19,7 +19,7 @@ from tests.modules import ROOT
 
 BRIDGE = dict(length=25.0, flexural_rigidity=30e9, mass_per_length=15e3, damping_ratio=0.015)
 RIGHT_FILES = [
-    *sorted((ROOT / "jaxbeam/rigs").glob("*.toml")),
+    *sorted((ROOT / "jaxbeam/case/library/rigs").glob("*.toml")),
     *sorted((ROOT / "examples").glob("*.toml")),
 ]
 
@@ -55,7 +55,7 @@ def test_a_weight_for_a_mass_per_length_is_noticed():
 
 
 def test_the_demonstration_is_plausible():
-    case = jb.load_case(ROOT / "jaxbeam/demo/rig.toml")
+    case = jb.load_case(ROOT / "jaxbeam/case/library/demo/rig.toml")
     assert jb.check(case).warnings == ()
     for mass, speed in ((0.05, 0.5), (0.6, 6.0)):
         loads = [jb.MovingMass(mass=mass, speed=speed)]

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import jaxbeam.numerics.polynomials
-from jaxbeam.integrator.discrete_model import PEAK_NODES
+from jaxbeam.simulation.integrator.discrete_model import PEAK_NODES
 
 EQUAL = tuple(float(share) for share in np.linspace(0.0, 1.0, 7))
 both_point_sets = pytest.mark.parametrize("points", [EQUAL, PEAK_NODES], ids=["equal", "of a step"])

@@ -15,7 +15,7 @@ import numpy as np
 from tests.oracles.crossing import Load, respond
 from tests.oracles.finite_elements import Beam, Suspension
 
-DEMO = Path(__file__).parents[2] / "jaxbeam" / "demo"
+DEMO = Path(__file__).parents[2] / "jaxbeam" / "case" / "library" / "demo"
 NOISE = 3e-6  # m, standard deviation of a reading
 SEED = 7
 SAMPLING = {"log_1": (1.6, 1000.0), "log_2": (1.0, 1000.0), "log_3": (0.8, 2000.0)}  # s, Hz

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 def cases():
     """Paths of the cases by name."""
     found = {path.parent.name: path for path in ROOT.glob("examples/*/case.toml")}
-    rigs = Path(str(resources.files("jaxbeam.rigs")))
+    rigs = Path(str(resources.files("jaxbeam.case.library.rigs")))
     return dict(sorted((found | {path.stem: path for path in rigs.glob("*.toml")}).items()))
 
 

@@ -204,7 +204,7 @@ def test_the_folder_of_the_cache_is_told(caplog, monkeypatch):
 
 def test_nothing_is_logged_by_default():
     program = (
-        "import jaxbeam as jb, logging; logging.getLogger('jaxbeam.sweeps').info('a decision')"
+        "import jaxbeam as jb, logging; logging.getLogger('jaxbeam.simulation').info('a decision')"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

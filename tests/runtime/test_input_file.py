@@ -15,8 +15,8 @@ import pytest
 
 import jaxbeam as jb
 import tuning
+from jaxbeam.export import read_gains
 from jaxbeam.files.case_file import load_case_with, profile_from_file
-from jaxbeam.files.export import read_gains
 from jaxbeam.files.tables import write_state_space, write_table
 from jaxbeam.runtime import input_file
 from jaxbeam.runtime.input_file import describe_content, read_input
@@ -242,19 +242,19 @@ def test_descriptions():
 # Modules that open files of the package, of the system or of the cache, or after `check_input`.
 BY_THEMSELVES = (
     "jaxbeam.runtime.",
-    "jaxbeam.library.",
+    "jaxbeam.case.library.",
     "jaxbeam.benchmark.",  # of the package
-    "jaxbeam.c_code.translation",
+    "jaxbeam.export.c_steps",
     "jaxbeam.analysis.assessment.assessment",
-    "jaxbeam.app.server",  # of the package
-    "jaxbeam.app.questions",  # what it wrote into a temporary folder
+    "jaxbeam.cli.page.server",  # of the package
+    "jaxbeam.cli.page.questions",  # what it wrote into a temporary folder
     "jaxbeam.case.loads.vehicles",
     "jaxbeam.cli.",
-    "jaxbeam.files.export.files",
+    "jaxbeam.export.gain_files",
     "jaxbeam.files.report",  # of the package
     "jaxbeam.files.netcdf",
     "jaxbeam.model.plausibility.check",  # of the package
-    "jaxbeam.sweeps.store",  # after `check_codecs`
+    "jaxbeam.simulation.sweeps.store",  # after `check_codecs`
     "tuning.logs.readers.table",
     "tuning.logs.readers.tdms",
 )
@@ -427,8 +427,8 @@ def test_nothing_is_written_at_its_place():
     Except caches, stores of sweeps, which are written in blocks under a lock, and what the page in
     the browser writes into a temporary folder of its own.
     """
-    by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.store"
-    by_themselves += "jaxbeam.app.studies", "jaxbeam.app.questions"
+    by_themselves = "jaxbeam.runtime.", "jaxbeam.simulation.sweeps.store"
+    by_themselves += "jaxbeam.cli.page.studies", "jaxbeam.cli.page.questions"
     writing = {"write_text", "write_bytes", "savefig", "savez", "to_netcdf", "to_zarr", "savemat"}
     wrong = []
     for module, path in module_files().items():

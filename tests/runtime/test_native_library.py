@@ -6,10 +6,10 @@ import shutil
 
 import pytest
 
-from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.cache_folder import read_file
 from jaxbeam.runtime.native_library import Library
+from jaxbeam.simulation.integrator import native_peaks
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 

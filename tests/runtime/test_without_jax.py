@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.app.conftest import RIG
+from tests.cli.page.conftest import RIG
 from tests.modules import ROOT
 from tests.runtime.known_runs import cases, main
 
@@ -66,7 +66,7 @@ def test_the_page_is_answered_and_what_is_missing_is_named(tmp_path):
     code = f"""
 import json
 from pathlib import Path
-from jaxbeam.app.questions import Page
+from jaxbeam.cli.page.questions import Page
 
 text = Path({str(case)!r}).read_text()
 page = Page(Path({str(tmp_path / "cases")!r}))

@@ -11,7 +11,7 @@ import jaxbeam as jb
 from jaxbeam import vehicles
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.state_controller import DesignModel
-from tests.c_code.cases import LATE, PERIOD
+from tests.export.cases import LATE, PERIOD
 from tests.model.test_layered_track import RIG
 from tests.strategies import CONTROLLED, LOADS, PROFILES
 

@@ -18,7 +18,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
-from jaxbeam.integrator.inputs import HeldCommands, StepInfo
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensor_signals import noise_samples
@@ -32,9 +31,10 @@ from jaxbeam.simulation.integration_plan import (
     sample_times,
     static_shapes,
 )
+from jaxbeam.simulation.integrator.inputs import HeldCommands, StepInfo
 from jaxbeam.simulation.simulate import run_integration, simulate_readings
-from jaxbeam.sweeps.native_integration import translated_loops
-from tests.c_code.cases import CASES
+from jaxbeam.simulation.sweeps.native_integration import translated_loops
+from tests.export.cases import CASES
 from tests.loop_as_oracle import expected
 from tests.modules import DATA
 

@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import value_at
-from jaxbeam.integrator.time_grid import Transmission, controller_schedule
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.integrator.time_grid import Transmission, controller_schedule
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.differences import central
 

@@ -10,7 +10,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.inputs import growth_limit, largest_by_marks
+from jaxbeam.simulation.integrator.inputs import growth_limit, largest_by_marks
 from tests.loop_as_oracle import expected
 
 DURATION, MODES = 4.0, 2  # s of a beam whose length, mass and stiffness are one
@@ -140,7 +140,7 @@ def test_bounded_loops_beyond_the_length_by_the_oracle():
     assert_allclose(found, truth, rtol=0, atol=1e-6 * np.abs(truth).max())
 
 
-@pytest.mark.filterwarnings("ignore::jaxbeam.sweeps.computation.FailedRunsWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.sweeps.computation.FailedRunsWarning")
 def test_sweeps_fail_where_the_loop_diverges_only():
     gains = np.array([0.0, 10.0, 1e5])
     runs = jb.sweep(SOFT, {"controller.gains.0": gains}, progress=False)

@@ -16,10 +16,10 @@ from jaxbeam.case.beam import rigidity
 from jaxbeam.case.case import replace
 from jaxbeam.case.loads.vehicles import Oscillator
 from jaxbeam.case.profiles.shapes import RampProfile
-from jaxbeam.integrator import native_peaks
 from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history
+from jaxbeam.simulation.integrator import native_peaks
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central
 from tests.modules import ROOT

@@ -15,8 +15,8 @@ import jaxbeam as jb
 from jaxbeam.analysis.sections import influence_table
 from jaxbeam.case.case import replace
 from jaxbeam.case.fields import PACKAGES, import_modules
+from jaxbeam.case.library.published import trains
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.library.published import trains
 from jaxbeam.plot import plot_envelope
 from jaxbeam.simulation import record as module
 from jaxbeam.simulation.integration_plan import integration_plan

@@ -20,13 +20,13 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_history
-from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.integration_plan import static_shapes
+from jaxbeam.simulation.integrator.discrete_model import discrete_model
+from jaxbeam.simulation.integrator.integrate import integrate_history
+from jaxbeam.simulation.integrator.time_grid import grid_by_step_length
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.differences import assert_close, load_of, plan_of
 from tests.fuzzing import examples

@@ -12,8 +12,8 @@ import scipy
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator import step_size
 from jaxbeam.simulation.integration_plan import common_plan, integration_plan
+from jaxbeam.simulation.integrator import step_size
 from jaxbeam.simulation.simulate import simulate_histories, simulate_readings
 from tests.differences import central
 

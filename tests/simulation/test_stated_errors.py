@@ -9,13 +9,13 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.sensors import QUANTITIES
-from jaxbeam.integrator.discrete_model import PEAK_NODES
-from jaxbeam.integrator.peaks import RunningPeaks
-from jaxbeam.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.errors import interpolation_errors
 from jaxbeam.simulation.integration_plan import AMPLIFICATION
+from jaxbeam.simulation.integrator.discrete_model import PEAK_NODES
+from jaxbeam.simulation.integrator.peaks import RunningPeaks
+from jaxbeam.simulation.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.loop_as_oracle import parts_of, span_of
 from tests.oracles.modal_equations import respond

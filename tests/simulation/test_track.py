@@ -13,8 +13,8 @@ from jaxbeam.analysis.assessment.checks import (
     tabulated_line,
     train_response,
 )
+from jaxbeam.case.library import published
 from jaxbeam.case.track import SLEEPER_FRACTIONS
-from jaxbeam.library import published
 from jaxbeam.numerics.polynomials import gauss_nodes, gauss_weights
 
 SLEEPERS = jb.Track(spread="3 sleepers")

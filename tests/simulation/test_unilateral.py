@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from experiments.thesis.cases import critical_speed, two_spans, with_modes, with_sensors
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 from jaxbeam.simulation import unilateral as lifting
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.oracles.lifting_wheels import Crossing, Wheel, moreau_steps

@@ -12,7 +12,7 @@ import scipy.signal
 
 import jaxbeam as jb
 from experiments.thesis.chapter2.identification import HAND_FITTED, with_log_modes
-from jaxbeam import rigs
+from jaxbeam.case.library import rigs
 from tests.oracles import finite_elements
 from tests.tuning.finite_element_rigs import Plant
 

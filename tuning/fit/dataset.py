@@ -17,10 +17,10 @@ from jaxbeam.case.sensors import unit_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
-from jaxbeam.integrator.time_grid import EventSchedule, stack_schedules
 from jaxbeam.model.elements import largest_layout
 from jaxbeam.model.plausibility.check import check
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
+from jaxbeam.simulation.integrator.time_grid import EventSchedule, stack_schedules
 from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
 from tuning.logs.log import Log
 from tuning.logs.quality import samples_held

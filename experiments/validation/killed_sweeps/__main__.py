@@ -29,7 +29,7 @@ import tomli_w
 import jaxbeam as jb
 from experiments.benchmarks.common import print_row, print_table
 from jaxbeam.files.case_file import case_to_dict
-from jaxbeam.sweeps.store import block_places
+from jaxbeam.simulation.sweeps.store import block_places
 
 ROOT = Path(__file__).parents[3]
 START = 120.0  # s, within which a process of the cluster starts

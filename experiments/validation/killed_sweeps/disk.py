@@ -18,7 +18,7 @@ AHEAD = float(os.environ.get("KILLED_SWEEPS_CLOCK", "0"))
 
 def change_writes() -> None:
     """Have blocks written slowly; the writing of some raises OSError, as without space."""
-    from jaxbeam.sweeps import store
+    from jaxbeam.simulation.sweeps import store
 
     slow, full = (float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL"))
     draws, append_block = random.Random(os.getpid()), store.append_block

@@ -17,10 +17,10 @@ from jaxbeam.analysis.assessment.checks import (
 from jaxbeam.analysis.sections import spans
 from jaxbeam.case.case import Case, Run, check_is_case
 from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced, suggestion
+from jaxbeam.case.library.published import trains as library
 from jaxbeam.case.toml_file import number_in_si
 from jaxbeam.case.track import THREE_SLEEPERS, Track, track_of
 from jaxbeam.case.validation import check_case
-from jaxbeam.library.published import trains as library
 from jaxbeam.model.modes import modes
 from jaxbeam.model.output_rows import counted_frequency
 from jaxbeam.model.plausibility.check import warn_if_implausible

@@ -35,11 +35,9 @@ from jaxbeam.analysis.sections import characteristic_points, spans
 from jaxbeam.case.beam import MATERIALS
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.library.published import trains as library
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.integrator.force_peaks import force_paths, force_wheels, peaks_of_forces
-from jaxbeam.integrator.force_system import force_responses, force_system
-from jaxbeam.library.published import trains as library
 from jaxbeam.model.along_beam import SETTLED, refined
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
@@ -52,9 +50,11 @@ from jaxbeam.model.output_rows import (
 )
 from jaxbeam.model.statics import REACTION, unit_of_effect
 from jaxbeam.runtime.progress import ProgressBar
-from jaxbeam.sweeps.computation import failure_sentence, peaks_in_memory
-from jaxbeam.sweeps.force_runner import PHASE
-from jaxbeam.sweeps.specification import sweep_specification
+from jaxbeam.simulation.integrator.force_peaks import force_paths, force_wheels, peaks_of_forces
+from jaxbeam.simulation.integrator.force_system import force_responses, force_system
+from jaxbeam.simulation.sweeps.computation import failure_sentence, peaks_in_memory
+from jaxbeam.simulation.sweeps.force_runner import PHASE
+from jaxbeam.simulation.sweeps.specification import sweep_specification
 
 LINE_POINTS = 801  # along the beam, between which influence lines are linear
 FRONT_POSITIONS = 8001  # of the first axle of a train

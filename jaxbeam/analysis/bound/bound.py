@@ -37,18 +37,6 @@ from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import check_on_beam, concrete, real_numbers, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
-from jaxbeam.integrator.discrete_model import NODE_COUNT, discrete_model
-from jaxbeam.integrator.inputs import AbstractInputPolicy
-from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
-from jaxbeam.integrator.peaks import RunningPeaks
-from jaxbeam.integrator.step_size import StaticShapes, choose_step_size, static_shapes
-from jaxbeam.integrator.time_grid import (
-    EventSchedule,
-    Transmission,
-    controller_schedule,
-    grid_by_schedule,
-    grid_by_step_length,
-)
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, Module, take, xp
@@ -56,6 +44,18 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.memory import block_memory, free_memory, size_text
 from jaxbeam.simulation.commands import acting_ranges
 from jaxbeam.simulation.integration_plan import steps_per_interval
+from jaxbeam.simulation.integrator.discrete_model import NODE_COUNT, discrete_model
+from jaxbeam.simulation.integrator.inputs import AbstractInputPolicy
+from jaxbeam.simulation.integrator.integrate import integrate_history, integrate_peaks
+from jaxbeam.simulation.integrator.peaks import RunningPeaks
+from jaxbeam.simulation.integrator.step_size import StaticShapes, choose_step_size, static_shapes
+from jaxbeam.simulation.integrator.time_grid import (
+    EventSchedule,
+    Transmission,
+    controller_schedule,
+    grid_by_schedule,
+    grid_by_step_length,
+)
 from jaxbeam.simulation.record import Record
 
 TOLERANCE = 1e-9  # relative to the largest deflection

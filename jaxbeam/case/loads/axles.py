@@ -17,6 +17,7 @@ from jaxbeam.case.fields import (
     number,
     suggestion,
 )
+from jaxbeam.case.library.published import LEFT_OUT, Train, line_loads, trains
 from jaxbeam.case.loads.base import (
     AbstractRowLoad,
     AbstractStandingLoad,
@@ -24,7 +25,6 @@ from jaxbeam.case.loads.base import (
     length_error,
     plain_wheels,
 )
-from jaxbeam.library.published import LEFT_OUT, Train, line_loads, trains
 from jaxbeam.runtime.arrays import Number, xp
 
 

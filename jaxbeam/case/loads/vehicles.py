@@ -450,7 +450,7 @@ def is_path(model: str) -> bool:
 @functools.cache
 def vehicle_names() -> tuple[str, ...]:
     """Names of the vehicles of the library."""
-    folder = resources.files("jaxbeam.library") / "models"
+    folder = resources.files("jaxbeam.case.library") / "models"
     names = (entry.name for entry in folder.iterdir())
     return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
 
@@ -498,7 +498,7 @@ def check_vehicle(vehicle: PlanarVehicle) -> None:
 
 @functools.cache
 def _library_vehicle(name: str) -> PlanarVehicle:
-    text = (resources.files("jaxbeam.library") / "models" / f"{name}.toml").read_text("utf-8")
+    text = (resources.files("jaxbeam.case.library") / "models" / f"{name}.toml").read_text("utf-8")
     return read_part("", tomllib.loads(text), PlanarVehicle)
 
 

@@ -173,10 +173,10 @@ def _sensor_words(case: "Case") -> list[str]:
 
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
     """Loads of a case, or one of a vehicle file, a vehicle or a train."""
+    from jaxbeam.case.library.published import trains
     from jaxbeam.case.loads.axles import Axles
     from jaxbeam.case.loads.vehicles import VehicleLoad
     from jaxbeam.files.case_file import load_case
-    from jaxbeam.library.published import trains
 
     if "beam" in content or "loads" in content:
         return load_case(source).loads
@@ -187,9 +187,9 @@ def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
 
 def _of_library(name: str) -> dict[str, Any]:
     from jaxbeam.case.fields import suggestion
+    from jaxbeam.case.library.published import trains
     from jaxbeam.case.loads.axles import Axles
     from jaxbeam.case.loads.vehicles import load_vehicle, vehicle_names
-    from jaxbeam.library.published import trains
 
     if name in trains():
         return _result(name, trains()[name].source, Axles(train=name, speed=1.0).vehicle, GRAVITY)
@@ -268,8 +268,8 @@ def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
 
 
 def _list_library(options: PrintOptions) -> None:
+    from jaxbeam.case.library.published import line_loads, trains
     from jaxbeam.case.loads.vehicles import load_vehicle, vehicle_names
-    from jaxbeam.library.published import line_loads, trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]

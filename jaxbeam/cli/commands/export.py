@@ -11,8 +11,8 @@ from jaxbeam.cli.options import CaseOptions
 if TYPE_CHECKING:
     import jaxbeam as jb
 
-PROGRAM_FILES = (".h", ".c", "_samples.h", "_check.c")  # of jaxbeam.c_code, added to the name
-# Those of jaxbeam.files.export.WRITERS (a test compares), known before JAX is imported.
+PROGRAM_FILES = (".h", ".c", "_samples.h", "_check.c")  # of jaxbeam.export, added to the name
+# Those of jaxbeam.export.WRITERS (a test compares), known before JAX is imported.
 GAIN_FILES = (".csv", ".mat", ".tdms", ".h")
 
 
@@ -59,13 +59,13 @@ def export(
         _write_program(parsed_case, output, files, options)
         return
     if is_unit:
-        from jaxbeam.fmi import write_fmu
+        from jaxbeam.export.fmi import write_fmu
 
         write_fmu(parsed_case, output, part or "beam", options.overwrite)
         options.report({"part": part or "beam"}, [], output)
         return
 
-    from jaxbeam.files.export import export_gains, write_gains
+    from jaxbeam.export import export_gains, write_gains
 
     gains = export_gains(parsed_case, points)
     write_gains(gains, output, options.overwrite)
@@ -78,7 +78,7 @@ def export(
 
 def _write_program(case: "jb.Case", output: Path, files: list[Path], options: CaseOptions) -> None:
     """Write the program of a controller in C, and print its cost and how to check it."""
-    from jaxbeam.c_code import export_c, write_c
+    from jaxbeam.export import export_c, write_c
 
     program = export_c(case, output.stem)
     write_c(program, output.parent, options.overwrite)

@@ -74,7 +74,7 @@ def app(case: Path | None = None, /, *, no_browser: bool = False, port: int = 0)
         check_exists("case file", case)
     _check_packages()
     enable_compile_cache()
-    from jaxbeam.app.server import serve
+    from jaxbeam.cli.page.server import serve
 
     folder, opened = (Path.cwd(), None) if case is None else (case.parent, case.name)
     if not no_browser:

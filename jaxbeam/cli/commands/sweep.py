@@ -111,7 +111,7 @@ def sweep(
     labels, limits = pictures.sensor_labels(parsed_case), _limits(parsed_case, limit)
     plausibility = _print_plausibility(parsed_case, values, options)
 
-    from jaxbeam.sweeps.cluster import connect
+    from jaxbeam.simulation.sweeps.cluster import connect
 
     with connect(scheduler) if scheduler else nullcontext() as client:
         results = jb.sweep(
@@ -221,7 +221,7 @@ def _fractiles(results: "xarray.Dataset", fractiles: dict[str, list[float]]) -> 
 
 def _statistics(results: "xarray.Dataset", fractiles: dict[str, list[float]]) -> dict:
     """Statistics over one address for each level, as content; empty without any."""
-    from jaxbeam.sweeps.realisations import realisations
+    from jaxbeam.simulation.sweeps.realisations import realisations
 
     found = []
     for address, levels in fractiles.items():
@@ -239,7 +239,7 @@ def _fractile_lines(
     """Statistics of the peak of each sensor, of the other values with the largest fractile."""
     import numpy as np
 
-    from jaxbeam.sweeps.realisations import CONFIDENCE, realisations, static_peaks
+    from jaxbeam.simulation.sweeps.realisations import CONFIDENCE, realisations, static_peaks
 
     ((address, levels),) = fractiles.items()
     static, rows = static_peaks(case, set(over)), []
@@ -277,7 +277,7 @@ def _fractile_lines(
 
 def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
     """Plausibility of the first run in a line, with warnings of the first and the last one."""
-    from jaxbeam.sweeps.sweep import first_and_last
+    from jaxbeam.simulation.sweeps.sweep import first_and_last
 
     ends = first_and_last(case, values)  # of wrong values the sweep says what is wrong
     return print_plausibility(ends[0], options, ends[-1]) if ends else {}
@@ -396,7 +396,7 @@ def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> N
     remove
         Remove the compiled code; sweeps use XLA until this command compiles it again.
     """
-    from jaxbeam.integrator import native_peaks
+    from jaxbeam.simulation.integrator import native_peaks
 
     if remove:
         path = native_peaks.LIBRARY.remove()

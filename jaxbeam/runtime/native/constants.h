@@ -1,5 +1,5 @@
 /* Numbers of the integrator in Python, written here too because wheels are compiled where there is no
- * JAX: tests/integrator/test_native_peaks.py compares them. */
+ * JAX: tests/simulation/integrator/test_native_peaks.py compares them. */
 
 #pragma once
 

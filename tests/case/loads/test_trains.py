@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.case.library.published import trains
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.loads.vehicles import load_vehicle
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.library.published import trains
 
 GRAVITY = np.float64(9.81)
 

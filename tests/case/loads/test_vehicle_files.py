@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.case.library.published import trains
 from jaxbeam.case.loads.vehicles import check_vehicle, load_vehicle, vehicle_names
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import (
@@ -17,7 +18,6 @@ from jaxbeam.files.case_file import (
     save_case,
     with_settings,
 )
-from jaxbeam.library.published import trains
 from tests.modules import ROOT
 
 GRAVITY = np.float64(9.81)

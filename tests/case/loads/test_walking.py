@@ -14,10 +14,10 @@ from scipy.integrate import quad, solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.analysis.footbridges import comfort_class, harmonic_fractions, stream_response
+from jaxbeam.case.library.published import line_loads
 from jaxbeam.case.loads.walking import contact_time, jogging_factors, walking_factors
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.library.published import line_loads
 from jaxbeam.model.load_set import load_set
 from tests.differences import central
 

@@ -19,10 +19,10 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Estimate, Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.crossing_gains import crossing_events, with_crossing_load
+from jaxbeam.control.estimation.crossing_filter import SampledWithVehicles
+from jaxbeam.control.estimation.sampled_plant import SampleTiming
 from jaxbeam.control.lqr import LQR
 from jaxbeam.control.state_controller import TrueState
-from jaxbeam.estimation.crossing_filter import SampledWithVehicles
-from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.finite_horizon import finite_horizon
 from jaxbeam.simulation.closed_loop import loop_schedule

@@ -18,6 +18,9 @@ from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
+from jaxbeam.control.estimation.kalman import Kalman
+from jaxbeam.control.estimation.observer import Observer
+from jaxbeam.control.estimation.sampled_plant import sample_timing
 from jaxbeam.control.lqr import LQR
 from jaxbeam.control.sampled_lqr import (
     SamplingWarning,
@@ -25,9 +28,6 @@ from jaxbeam.control.sampled_lqr import (
     sampled_reachability,
     sampling_limit,
 )
-from jaxbeam.estimation.kalman import Kalman
-from jaxbeam.estimation.observer import Observer
-from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 

@@ -213,7 +213,7 @@ def test_a_sensor_away_from_the_centre_of_mass_feels_the_pitch(tmp_path):
 
 # Fits to crossings of a suspended vehicle over a road that the model does not have.
 
-DEMO = Path(jb.__file__).parent / "demo"
+DEMO = Path(jb.__file__).parent / "case" / "library" / "demo"
 SUSPENSION = jb.Case(
     jb.Beam(25.0, 1.2e10, 9000.0, damping_ratio=0.012, modes=4),
     sensors=[
