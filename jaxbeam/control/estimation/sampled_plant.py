@@ -78,16 +78,19 @@ MAX_STEPS, MAX_PHASE_PER_STEP = 8, 0.6
 
 
 def step_count(plant: Plant, period: Number) -> int:
-    """Number of steps of a period (s), or of each of its two parts, for a plant that varies."""
+    """Number of steps of a period (s), or of each of its two parts, for a plant that varies.
+
+    Traced vehicles do not count, so that a run has the same steps whether they are traced or not
+    unless they are faster than the highest mode.
+    """
     rates = plant.modal_model.modes.angular_frequencies
     if not (is_concrete(rates) and is_concrete(period)):
         return MAX_STEPS
     fastest = np.max(concrete(rates))
     if plant.vehicle_states:
         system = vehicle_system(plant.loads)[0]
-        if not is_concrete(system):
-            return MAX_STEPS
-        fastest = max(fastest, np.max(np.abs(np.linalg.eigvals(concrete(system)))))
+        if is_concrete(system):
+            fastest = max(fastest, np.max(np.abs(np.linalg.eigvals(concrete(system)))))
     return min(MAX_STEPS, math.ceil(float(concrete(period)) * fastest / MAX_PHASE_PER_STEP))
 
 
