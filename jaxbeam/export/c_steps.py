@@ -243,19 +243,20 @@ def sharing_memory(lines: Sequence[str]) -> tuple[list[str], int]:
 
     Also the bytes of all arrays in double precision. An array is used from its declaration to the
     last line with its name, or to the end of the block within the block of its declaration that
-    this line is in, as the block may be a loop.
+    this line is in or opens, as the block may be a loop.
     """
     last_use: dict[str, int] = {}
     opened: list[int] = []  # lines that open the blocks around the present one
     closed: dict[int, int] = {}  # line that closes a block, by the line that opens it
     around: list[tuple[int, ...]] = []
     for number, line in enumerate(lines):
-        around.append(tuple(opened))
+        outer = tuple(opened)
         for sign in re.findall(r"[{}]", line):
             if sign == "{":
                 opened.append(number)
             else:
                 closed[opened.pop()] = number
+        around.append(max(outer, tuple(opened), key=len))
         last_use |= dict.fromkeys(re.findall(r"\bv\d+\b", line), number)
     declared, sizes = [], {"real": 0, "int": 0}
     for number, line in enumerate(lines):
