@@ -85,6 +85,53 @@ def test_a_rig_of_two_spans_is_built_from_nothing_and_computed_as_by_the_command
         assert shown[side][0] == pytest.approx(sensor[side], rel=1e-9)
 
 
+def drawn_anew(page, address):
+    """Mark a field and return a condition: the field has been replaced by a new one."""
+    field(page, address).evaluate("(one) => (one.old = true)")
+    return lambda: not field(page, address).evaluate("(one) => one.old ?? false")
+
+
+def test_a_press_outlives_the_answer_to_an_edit_that_comes_before_its_release(page):
+    open_all(page)
+    field(page, "loads.0.mass").fill("0.7")
+    anew = drawn_anew(page, "loads.0.mass")
+    summary = page.locator("summary", has_text=re.compile("^sensors", re.I)).first
+    summary.scroll_into_view_if_needed()
+    box = summary.bounding_box()
+    page.mouse.move(box["x"] + 20, box["y"] + box["height"] / 2)
+    page.mouse.down()  # the field loses the focus: its edit is asked for
+    wait_for(lambda: "mass = 0.7 " in text_of(page))
+    page.wait_for_timeout(500)
+    page.mouse.up()
+    wait_for(anew)
+    assert page.locator('details[data-opens="sensors"]').get_attribute("open") is None
+
+
+def test_a_selection_and_a_caret_stay_where_fields_are_drawn_anew(page):
+    open_all(page)
+    mass = field(page, "loads.0.mass")
+    mass.fill("0.715")
+    anew = drawn_anew(page, "loads.0.mass")
+    mass.evaluate("(one) => one.setSelectionRange(1, 3) ?? one.dispatchEvent(new Event('change'))")
+    wait_for(anew)
+    assert mass.evaluate("(one) => [one.selectionStart, one.selectionEnd]") == [1, 3]
+
+
+def test_two_edits_at_once_are_both_kept(page):
+    open_all(page)
+    page.evaluate(
+        """() => {
+            const edits = { "loads.0.mass": "0.7", "sensors.0.position": "0.25" };
+            for (const [address, value] of Object.entries(edits)) {
+                const one = document.getElementById(`field-${address}`);
+                one.value = value;
+                one.dispatchEvent(new Event("change"));
+            }
+        }"""
+    )
+    wait_for(lambda: "mass = 0.7 " in text_of(page) and "position = 0.25" in text_of(page))
+
+
 def test_wrong_input_is_marked_at_its_place_with_the_sentence_of_the_library(page):
     open_all(page)
     field(page, "loads.0.mass").fill("-1")

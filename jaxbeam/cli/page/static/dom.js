@@ -45,6 +45,25 @@ export function svg(tag, attributes = {}, ...children) {
   return element;
 }
 
+let pressed = false;
+/** @type {Set<() => void>} */ const waiting = new Set();
+
+/** @param {PointerEvent} event */
+function press(event) {
+  if (event.button === 0) pressed = event.type === "pointerdown";
+  if (!pressed) setTimeout(() => { // after the click
+    for (const work of pressed ? [] : waiting) waiting.delete(work) && work();
+  });
+}
+for (const kind of /** @type {const} */ (["pointerdown", "pointerup", "pointercancel"])) globalThis.addEventListener?.(kind, press, true);
+
+/**
+ * Work that waits while a button is pressed: what is drawn anew between a press and its release
+ * loses the click.
+ * @param {() => void} work
+ */
+export const released = (work) => () => pressed ? void waiting.add(work) : work();
+
 /**
  * Tabs and their panels; only the chosen one is shown.
  * @param {string} label

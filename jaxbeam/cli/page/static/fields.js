@@ -1,6 +1,6 @@
 // Fields of all tables of a case, made from the JSON Schema of case files: nothing is typed again.
 
-import { html, number, raised } from "./dom.js";
+import { html, number, raised, released } from "./dom.js";
 
 /** @typedef {Record<string, any>} Schema */
 
@@ -81,8 +81,8 @@ export function createFields(store, context) {
   const element = html("div.fields");
   const open = new Set(["beam", "loads.0"]);
 
-  store.on("model", build);
-  store.on("schema", build);
+  store.on("model", released(build));
+  store.on("schema", released(build));
 
   function build() {
     const { schema, model } = store;
@@ -90,6 +90,8 @@ export function createFields(store, context) {
     const active = /** @type {HTMLInputElement | null} */ (element.contains(document.activeElement) ? document.activeElement : null);
     const place = active?.dataset.address;
     const typed = active?.matches("input") && active.value !== active.getAttribute("value") ? active.value : null;
+    const selected = active?.matches("input") ? /** @type {const} */ ([active.selectionStart, active.selectionEnd]) : null;
+    for (const details of element.querySelectorAll("details")) details.open ? open.add(details.dataset.opens) : open.delete(details.dataset.opens);
     element.replaceChildren(
       titleField(),
       ...Object.entries(schema.properties).filter(([key]) => key !== "title").map(([key, own]) => group(key, /** @type {Schema} */ (own))),
@@ -97,6 +99,7 @@ export function createFields(store, context) {
     const again = place ? /** @type {HTMLInputElement | null} */ (element.querySelector(`[data-address="${place}"]`)) : null;
     if (again && typed !== null) again.value = typed; // what is being typed stays
     again?.focus();
+    if (again && selected) again.setSelectionRange(...selected);
   }
 
   function titleField() {
@@ -121,10 +124,8 @@ export function createFields(store, context) {
   function disclosure(address, title, body) {
     const { problem } = store.model;
     const wrong = problem?.address === address || (problem?.address?.startsWith(`${address}.`) ?? false);
-    const details = html("details", { open: open.has(address) || wrong }, html("summary", {}, title),
+    return html("details", { open: open.has(address) || wrong, "data-opens": address }, html("summary", {}, title),
       ...(problem?.address === address ? [html("p.wrong", {}, problem.message)] : []), body);
-    details.addEventListener("toggle", () => (details.open ? open.add(address) : open.delete(address)));
-    return details;
   }
 
   /** @param {string} address @param {Schema} schema @param {any} content @param {string} title @param {boolean} removable */
@@ -160,9 +161,7 @@ export function createFields(store, context) {
     found.push(...first.map(make));
     if (others.length) {
       const wrong = others.some(([key]) => store.model.problem?.address === `${address}.${key}`);
-      const more = html("details.more", { open: wrong || open.has(`${address}/more`) }, html("summary", {}, `${others.length} more`), ...others.map(make));
-      more.addEventListener("toggle", () => (more.open ? open.add(`${address}/more`) : open.delete(`${address}/more`)));
-      found.push(more);
+      found.push(html("details.more", { open: wrong || open.has(`${address}/more`), "data-opens": `${address}/more` }, html("summary", {}, `${others.length} more`), ...others.map(make)));
     }
     return found;
   }

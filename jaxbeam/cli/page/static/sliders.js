@@ -1,6 +1,6 @@
 // Sliders for numbers of the case. While one moves the run follows; released, it changes the text.
 
-import { html, number, scaled } from "./dom.js";
+import { html, number, released, scaled } from "./dom.js";
 
 // Numbers that have a slider at first, the first few that a case has.
 const USUAL = [/^loads\.0\.speed$/, /^loads\.0\.(mass|force|weight|body_mass)$/, /^controller\.(gains?|[a-z_]*weight)(\.0)?$/, /^beam\.(flexural_rigidity|youngs_modulus)$/, /^beam\.damping_ratio$/];
@@ -27,7 +27,7 @@ export function createSliders(store) {
     chosen = null;
     rows.clear();
   });
-  store.on("model", build);
+  store.on("model", released(build));
 
   function build() {
     const { numbers } = store.model;

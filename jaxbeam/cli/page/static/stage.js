@@ -1,6 +1,6 @@
 // The beam to scale, its parts to drag, and the run over it, frame by frame.
 
-import { html, number, scaled, svg } from "./dom.js";
+import { html, number, released, scaled, svg } from "./dom.js";
 import { indexAt } from "./plot.js";
 import { drawVehicle } from "./vehicle.js";
 
@@ -33,8 +33,9 @@ export function createStage(store) {
     build();
   }).observe(picture);
 
-  store.on("model", build);
-  store.on("run", build);
+  const calmly = released(build);
+  store.on("model", calmly);
+  store.on("run", ({ preview }) => (preview ? build() : calmly()));
   store.on("cursor", update);
 
   function toggle() {

@@ -21,6 +21,7 @@ export class Store extends EventTarget {
   #previewing = false;
   #running = false;
   #timer = 0;
+  /** @type {Promise<unknown>} */ #changes = Promise.resolve();
 
   /** @param {string} kind @param {any} [detail] */
   #tell(kind, detail) {
@@ -146,15 +147,19 @@ export class Store extends EventTarget {
   }
 
   /**
-   * Change entries of the text: {set: address, to: value}, {remove: address}.
+   * Change entries of the text, one call after the other: {set: address, to: value}, {remove: address}.
    * @param {...Record<string, any>} changes
    */
-  async change(...changes) {
-    const base = this.text;
-    await this.attempt(async () => {
-      const { text } = await ask("change", { text: base, changes });
-      if (base === this.text) await this.write(text);
+  change(...changes) {
+    const work = () => this.attempt(async () => {
+      let base, found;
+      do {
+        base = this.text;
+        found = await ask("change", { text: base, changes });
+      } while (base !== this.text);
+      await this.write(found.text);
     });
+    return (this.#changes = this.#changes.then(work, work));
   }
 
   /**
