@@ -132,6 +132,24 @@ def test_two_edits_at_once_are_both_kept(page):
     wait_for(lambda: "mass = 0.7 " in text_of(page) and "position = 0.25" in text_of(page))
 
 
+def test_undo_comes_after_the_edits_before_it_and_takes_back_one_of_them(page):
+    open_all(page)
+    before = text_of(page)
+    page.evaluate(
+        """() => {
+            const one = document.getElementById("field-loads.0.mass");
+            one.value = "0.7";
+            one.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter" }));
+            one.dispatchEvent(new Event("change"));
+            const undo = { key: "z", ctrlKey: true, bubbles: true };
+            document.body.dispatchEvent(new KeyboardEvent("keydown", undo));
+        }"""
+    )
+    wait_for(page.get_by_role("button", name="Redo").is_enabled)
+    page.wait_for_timeout(500)
+    assert text_of(page) == before
+
+
 def test_wrong_input_is_marked_at_its_place_with_the_sentence_of_the_library(page):
     open_all(page)
     field(page, "loads.0.mass").fill("-1")

@@ -207,11 +207,12 @@ export function createFields(store, context) {
     const input = schema.enum
       ? html("select", common, html("option", { value: "" }, places ? `${places} (default)` : "–"), ...schema.enum.map((/** @type {string} */ word) => html("option", { selected: word === value }, word)))
       : html("input", { ...common, value: shown(value), placeholder: places, list: context.names[key] ? `names-${key}` : null, autocomplete: "off", spellcheck: "false" });
-    const commit = () => {
+    let asked = value ?? null;
+    const commit = () => { // Enter may be followed by a change of the same
       const typed = parsed(input.value, schema);
-      if (typed === null) {
-        if (value !== undefined) store.change({ remove: address });
-      } else if (JSON.stringify(typed) !== JSON.stringify(value)) store.change({ set: address, to: typed });
+      if (JSON.stringify(typed) === JSON.stringify(asked)) return;
+      asked = typed;
+      store.change(typed === null ? { remove: address } : { set: address, to: typed });
     };
     input.addEventListener("change", commit);
     input.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && commit());

@@ -21,7 +21,7 @@ export class Store extends EventTarget {
   #previewing = false;
   #running = false;
   #timer = 0;
-  /** @type {Promise<unknown>} */ #changes = Promise.resolve();
+  /** @type {Promise<unknown>} */ #turns = Promise.resolve();
 
   /** @param {string} kind @param {any} [detail] */
   #tell(kind, detail) {
@@ -87,18 +87,26 @@ export class Store extends EventTarget {
     await this.#take(text);
   }
 
-  async undo() {
-    const text = this.#undo.pop();
+  undo() {
+    return this.#inTurn(() => this.#step(this.#undo, this.#redo));
+  }
+
+  redo() {
+    return this.#inTurn(() => this.#step(this.#redo, this.#undo));
+  }
+
+  /** @param {string[]} from @param {string[]} to */
+  async #step(from, to) {
+    const text = from.pop();
     if (text === undefined) return;
-    this.#redo.push(this.text);
+    to.push(this.text);
     await this.#take(text);
   }
 
-  async redo() {
-    const text = this.#redo.pop();
-    if (text === undefined) return;
-    this.#undo.push(this.text);
-    await this.#take(text);
+  /** Do some work after what was asked before it. @param {() => Promise<void>} work */
+  #inTurn(work) {
+    const turn = () => this.attempt(work);
+    return (this.#turns = this.#turns.then(turn, turn));
   }
 
   /** @param {string} text */
@@ -151,7 +159,7 @@ export class Store extends EventTarget {
    * @param {...Record<string, any>} changes
    */
   change(...changes) {
-    const work = () => this.attempt(async () => {
+    return this.#inTurn(async () => {
       let base, found;
       do {
         base = this.text;
@@ -159,7 +167,6 @@ export class Store extends EventTarget {
       } while (base !== this.text);
       await this.write(found.text);
     });
-    return (this.#changes = this.#changes.then(work, work));
   }
 
   /**
