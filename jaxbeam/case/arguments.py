@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxbeam.runtime.printer import counted
+
 F = typing.TypeVar("F", bound=Callable)
 OWN_PACKAGES = ("jaxbeam.", "tuning.")
 MAKERS = {  # how a newcomer comes by an object of a class
@@ -139,7 +141,7 @@ def _description(declared: Any) -> str:
     if origin in (typing.Union, types.UnionType):
         return " or ".join(dict.fromkeys(map(_description, parts)))
     if origin is tuple and Ellipsis not in parts:
-        return f"a list of {len(parts)} numbers"
+        return f"a list of {counted(len(parts), 'number')}"
     if origin in (Sequence, tuple, list):
         return f"a list of {_name(parts[0])}" if _is_own(parts[0]) else "a list"
     if origin in (Mapping, dict) and _is_mapping(parts[-1]):

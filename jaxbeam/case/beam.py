@@ -26,6 +26,7 @@ from jaxbeam.case.fields import (
     validate_direct_or_derived,
 )
 from jaxbeam.runtime.arrays import Array, Number, xp
+from jaxbeam.runtime.printer import counted
 
 LIMIT_SPAN = 20.0  # m: shorter spans have more damping
 
@@ -550,7 +551,8 @@ class Beam(ReprWithUnits):
         ratio_shape = np.shape(self.damping_ratio)
         if ratio_shape and ratio_shape != (self.modes,):
             return (
-                f"{address}.damping_ratio lists {ratio_shape[0]} values for {self.modes} modes;"
+                f"{address}.damping_ratio lists {counted(ratio_shape[0], 'value')} for"
+                f" {self.modes} modes;"
                 " give one for each mode, or a single number for all"
             )
         given = []

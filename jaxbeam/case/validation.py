@@ -37,6 +37,7 @@ from jaxbeam.case.sensors import NO_TORSION, QUANTITIES, Sensor, nyquist_error, 
 from jaxbeam.case.toml_file import MAX_WHEELS, check_length
 from jaxbeam.case.track import Track
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.printer import counted
 
 # Parts with a method `validate(address)`.
 SELF_VALIDATING = (
@@ -363,7 +364,8 @@ def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> No
         raise ValueError(f"{address}.quantity is 'stroke', that of an absorber: give its number")
     if sensor.load >= len(case.loads):
         raise ValueError(
-            f"{address}.load is {sensor.load}, but the case has {len(case.loads)} loads, counted"
+            f"{address}.load is {sensor.load}, but the case has"
+            f" {counted(len(case.loads), 'load')}, counted"
             " from 0"
         )
     load = case.loads[sensor.load]

@@ -26,7 +26,7 @@ from jaxbeam.cli.arguments import (
     parse_value,
 )
 from jaxbeam.runtime.output_file import refuse_folder, whole_file
-from jaxbeam.runtime.printer import text_table
+from jaxbeam.runtime.printer import counted, text_table
 
 if TYPE_CHECKING:
     from jaxbeam.model.plausibility.facts import Plausibility
@@ -280,7 +280,7 @@ class LabelledPictureOptions(PictureOptions):
         names = [name.strip() for name in self.labels.split(",")] if self.labels else None
         if names is not None and len(names) != len(case.sensors):
             raise UsageError(
-                f"--labels names {len(names)} sensors; the case has {len(case.sensors)}"
+                f"--labels names {counted(len(names), 'sensor')}; the case has {len(case.sensors)}"
             )
         return names
 

@@ -30,6 +30,7 @@ from jaxbeam.control.load_identification import (
     identification_error,
 )
 from jaxbeam.runtime.arrays import Array, Number, take, xp
+from jaxbeam.runtime.printer import counted
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
@@ -38,7 +39,10 @@ def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
     if loops != actuators:
         return f"gains must list one gain for each of {actuators} actuators, not {loops}"
     if loops > len(case.sensors):
-        return f"gains has {loops} entries, but there are only {len(case.sensors)} sensors"
+        return (
+            f"gains has {counted(loops, 'entry', 'entries')}, but there are only"
+            f" {counted(len(case.sensors), 'sensor')}"
+        )
     return None
 
 

@@ -42,6 +42,7 @@ from jaxbeam.control.prediction import sampled_plant
 from jaxbeam.control.state_controller import DesignModel
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, Number, add_at, solve, take, xp
+from jaxbeam.runtime.printer import counted
 
 SAME_SAMPLE = 1e-9  # of a period: a time that is nearer to a sample is at it
 
@@ -228,7 +229,7 @@ class GPC(AbstractController):
             value = getattr(self, name)
             allowed = [(size,)] if name == "reference" else [(), (size,)]
             if value is not None and value.shape not in allowed:
-                return f"{name} must have {size} entries, not {value.size}"
+                return f"{name} must have {counted(size, 'entry', 'entries')}, not {value.size}"
         error = None if self.design is None else self.design.validate(case)
         return None if error is None else f"design.{error}"
 
@@ -336,7 +337,10 @@ class AdaptiveGPC(GPC):
         if self.probe is not None and self.until is None:
             return "probe needs a time to end: give until"
         if self.probe is not None and self.probe.shape not in ((), (len(case.driven),)):
-            return f"probe must have {len(case.driven)} entries, not {self.probe.size}"
+            return (
+                f"probe must have {counted(len(case.driven), 'entry', 'entries')}, not"
+                f" {self.probe.size}"
+            )
         return super().validate(case)
 
     def design_law(self, plant):

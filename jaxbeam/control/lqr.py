@@ -47,6 +47,7 @@ from jaxbeam.numerics.finite_horizon import GainTable, boundary_layer
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.runtime.arrays import Array, Number, set_at, to_numpy, xp
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.printer import counted
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
 
@@ -413,7 +414,7 @@ class LQR(AbstractStateController):
         for name, size in sizes.items():
             value = getattr(self, name)
             if value is not None and value.shape[0] != size:
-                return f"{name} must have {size} entries, not {value.shape[0]}"
+                return f"{name} must have {counted(size, 'entry', 'entries')}, not {value.shape[0]}"
         for name, other in (("positions", "position_weight"), ("reference", "integral_weight")):
             pair = getattr(self, name), getattr(self, other)
             if (pair[0] is None) != (pair[1] is None):
@@ -461,7 +462,8 @@ class LQR(AbstractStateController):
         outputs = self.reference.shape[0]
         if outputs > len(case.driven):
             return (
-                f"reference must have at most {len(case.driven)} entries, one for each actuator:"
+                "reference must have at most"
+                f" {counted(len(case.driven), 'entry', 'entries')}, one for each actuator:"
                 " so many deflections can be commanded"
             )
         sensors = case.sensors[:outputs]

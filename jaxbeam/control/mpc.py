@@ -54,6 +54,7 @@ from jaxbeam.control.state_controller import (
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.qp import METHODS, QuadraticProgram, first_move
 from jaxbeam.runtime.arrays import Array, Number, add_at, set_at, take, xp
+from jaxbeam.runtime.printer import counted
 
 
 class CommandLimits(NamedTuple):
@@ -409,7 +410,7 @@ class MPC(AbstractStateController):
             value = getattr(self, name)
             if value is not None and value.shape not in allowed:
                 allowed_sizes = " or ".join(
-                    "one number" if not s else f"{s[0]} entries" for s in allowed
+                    "one number" if not s else counted(s[0], "entry", "entries") for s in allowed
                 )
                 return f"{name} must have {allowed_sizes}, not {value.size}"
         pole = self.laguerre_pole

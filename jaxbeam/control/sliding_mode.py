@@ -20,6 +20,7 @@ from jaxbeam.control.state_controller import (
     deflection_rows,
 )
 from jaxbeam.runtime.arrays import Array, Number, solve, xp
+from jaxbeam.runtime.printer import counted
 
 SMALLEST_EFFECT = 1e-9  # of the commands on the surfaces, of that on all modes
 
@@ -75,7 +76,8 @@ class SlidingMode(AbstractStateController):
             return "kind needs an actuator that takes commands"
         if self.positions is None and len(case.sensors) < outputs:
             return (
-                f"positions must be given: there are {len(case.sensors)} sensors for {outputs}"
+                f"positions must be given: there are {counted(len(case.sensors), 'sensor')}"
+                f" for {outputs}"
                 " actuators"
             )
         if self.positions is not None and self.positions.shape[0] != outputs:

@@ -53,7 +53,7 @@ from jaxbeam.model.output_rows import row_on_states, sensor_rows
 from jaxbeam.runtime.arrays import Array, Module, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.runtime.printer import TableViews, labelled_dataset
+from jaxbeam.runtime.printer import TableViews, counted, labelled_dataset
 
 POINT_QUANTITIES = tuple(
     name for name, entry in QUANTITIES.items() if not (entry.at_fibre or entry.over_modulus)
@@ -304,7 +304,10 @@ class FrequencyResponse(TableViews, Module):
             return f"FrequencyResponse{pairs}"
         first, last = concrete(self.frequencies)[[0, -1]]
         count = self.frequencies.size
-        return f"FrequencyResponse at {count} frequencies, {first:.4g} to {last:.4g} Hz{pairs}"
+        return (
+            f"FrequencyResponse at {counted(count, 'frequency', 'frequencies')}, {first:.4g}"
+            f" to {last:.4g} Hz{pairs}"
+        )
 
     @property
     def magnitude(self) -> Float[Array, "frequency pair"]:

@@ -48,6 +48,7 @@ from jaxbeam.numerics.stages import c2d
 from jaxbeam.runtime.arrays import Array, Module, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import counted
 
 
 class Signal(NamedTuple):
@@ -204,7 +205,8 @@ class Plant(Module):
         count = self.coordinate_scale.shape[-1]
         title = f" of {self.case.title!r}" if self.case.title else ""
         return (
-            f"Plant{title}: {count} modes in {self.coordinate.name} ({self.coordinate.unit});"
+            f"Plant{title}: {counted(count, 'mode')} in {self.coordinate.name}"
+            f" ({self.coordinate.unit});"
             " .at(t) returns the StateSpace at a time t (s)"
         )
 

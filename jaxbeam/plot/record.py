@@ -36,6 +36,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.record import Record
 
 
@@ -103,7 +104,9 @@ def _names(case: Case, labels: Sequence[str] | None) -> list[str]:
     if labels is None:
         return [sensor.name for sensor in case.sensors]
     if len(labels) != len(case.sensors):
-        raise ValueError(f"labels names {len(labels)} sensors; the case has {len(case.sensors)}")
+        raise ValueError(
+            f"labels names {counted(len(labels), 'sensor')}; the case has {len(case.sensors)}"
+        )
     return list(labels)
 
 

@@ -47,6 +47,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.sweeps.realisations import CONFIDENCE, realisations
 
 FAST = 20.0  # m/s: from here on speeds are in km/h
@@ -367,7 +368,9 @@ def _sensor_names(peaks, case: Case, labels: Sequence[str] | None) -> list[str]:
     numbers = sensor_numbers(peaks, case)
     if labels is not None:
         if len(labels) != len(numbers):
-            raise ValueError(f"labels names {len(labels)} sensors; the sweep has {len(numbers)}")
+            raise ValueError(
+                f"labels names {counted(len(labels), 'sensor')}; the sweep has {len(numbers)}"
+            )
         return list(labels)
     swept = any(str(address).startswith("sensors.") for address in peaks.coords)
     positions = [f"at {float(concrete(case.sensors[i].position)):.4g} m" for i in numbers]
@@ -542,6 +545,6 @@ def plot_realisations(
         axes.axvspan(max(low, left), min(high, right), label=words, **band)
         axes.set_xlim(left, right)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderpad=0.2)
-    words = f"{dataset.sizes[address]} values of the {address_words(case, address)}"
+    words = f"{counted(dataset.sizes[address], 'value')} of the {address_words(case, address)}"
     set_title(figure, title, "\n".join(filter(None, [case.title, words])), ax)
     return figure

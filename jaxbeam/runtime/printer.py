@@ -25,6 +25,15 @@ UNIT = re.compile(r"\([^()]{1,9}\)")  # as "(N m)", which is not broken
 MAX_SHOWN = 20  # rows of a result
 
 
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """A number of things, as in a sentence.
+
+    >>> counted(1, "load"), counted(3, "load"), counted(2, "entry", "entries")
+    ('1 load', '3 loads', '2 entries')
+    """
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
 def terminal_width() -> int | None:
     """Characters in a line: COLUMNS, or those of the terminal; None where output goes elsewhere."""
     try:

@@ -9,8 +9,8 @@ from typing import Any
 from tqdm import tqdm
 
 # "512/512 runs [00:01<00:00]", and "8 points [00:10]" of work of unknown length.
-KNOWN_LENGTH = "{l_bar}{bar}| {n_fmt}/{total_fmt} {unit}s [{elapsed}<{remaining}{postfix}]"
-UNKNOWN_LENGTH = "{desc}: {n_fmt} {unit}s [{elapsed}{postfix}]"
+KNOWN_LENGTH = "{l_bar}{bar}| {n_fmt}/{total_fmt} {units} [{elapsed}<{remaining}{postfix}]"
+UNKNOWN_LENGTH = "{desc}: {n_fmt} {units} [{elapsed}{postfix}]"
 # Called with the steps done, those of the whole, and what a step is; what it raises ends the work.
 OnStep = Callable[[int, int, str], None]
 _ON_STEP: contextvars.ContextVar[OnStep | None] = contextvars.ContextVar("on_step", default=None)
@@ -45,6 +45,12 @@ class ProgressBar(tqdm):
         self._done += int(n or 0)
         self._tell()
         return shown
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        found = super().format_dict
+        number = found["n"] if found["total"] is None else found["total"]
+        return found | {"units": f"{found['unit']}{'' if number == 1 else 's'}"}
 
     def skip(self, steps: int) -> None:
         """Count steps of an earlier attempt as done; they do not add to the rate."""

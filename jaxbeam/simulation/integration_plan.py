@@ -27,6 +27,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, Module, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.closed_loop import closed_loop, loop_of_case, loop_schedule, moves_events
 from jaxbeam.simulation.errors import step_errors
 from jaxbeam.simulation.integrator.discrete_model import discrete_model
@@ -142,7 +143,8 @@ def check_origin(
         )
     if own.max_loads > shapes.max_loads:
         raise ValueError(
-            f"the plan was made for at most {shapes.max_loads} loads on the beam at once, and there"
+            f"the plan was made for at most {counted(shapes.max_loads, 'load')} on the beam"
+            " at once, and there"
             f" are {own.max_loads}: {INSTEAD}"
         )
     ratio = origin.max_stable_step / float(model_limits(case, own.layout)[0])
@@ -192,7 +194,7 @@ def _same(a: Float[np.ndarray, " time"], b: Float[np.ndarray, " time"]) -> bool:
 
 
 def _words(times: Float[np.ndarray, " time"]) -> str:
-    return f"{times.size} samples from {times[0]:.4g} to {times[-1]:.4g} s"
+    return f"{counted(times.size, 'sample')} from {times[0]:.4g} to {times[-1]:.4g} s"
 
 
 TOLERANCE = 1e-7  # relative to the largest deflection

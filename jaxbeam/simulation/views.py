@@ -25,7 +25,7 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array, Module, any_traced
 from jaxbeam.runtime.output_file import check_ending, whole_file
-from jaxbeam.runtime.printer import TableViews, html_table, labelled_dataset, text_table
+from jaxbeam.runtime.printer import TableViews, counted, html_table, labelled_dataset, text_table
 from jaxbeam.simulation.errors import Extremes
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def contact_sentence(case: Case, loads: LoadSet, lost_times, lost_positions, low
     pulling = np.flatnonzero(negative & prescribed)
     if pulling.size and not lost.size:
         i = int(pulling[np.argmin(lowest_forces[pulling])])
-        more = f" and {pulling.size - 1} others" if pulling.size > 1 else ""
+        more = f" and {counted(pulling.size - 1, 'other')}" if pulling.size > 1 else ""
         return (
             f"the prescribed force of load {wheel_labels(loads)[i]}{more} is negative at times,"
             f" down to {lowest_forces[i]:.4g} N, as given"
@@ -362,7 +362,7 @@ def record_html(case: Case, times, verdict: str, extremes: Extremes) -> str:
 
 def _head(case: Case, times) -> str:
     times = np.asarray(times)
-    parts = [f"{times.size} samples to {times[-1]:.4g} s"]
+    parts = [f"{counted(times.size, 'sample')} to {times[-1]:.4g} s"]
     for count, word in ((len(case.sensors), "sensor"), (len(case.loads), "load")):
         parts.append(f"{count} {word}{'s' * (count != 1)}")
     head = f"Record of {case.title!r}" if case.title else "Record"

@@ -214,7 +214,7 @@ def test_pictures_have_endings_sizes_and_titles(run, folder):
 
 def test_labels_name_every_sensor(refused):
     message = refused("simulate case.toml --plot --labels one")
-    assert message == "--labels names 1 sensors; the case has 2"
+    assert message == "--labels names 1 sensor; the case has 2"
 
 
 def test_film_needs_ffmpeg(run, refused, folder, monkeypatch):

@@ -204,7 +204,7 @@ def estimated_by(value) -> jb.LQR:
 ERRORS = [
     ({"actuators": ()}, "controller has nothing to command: add an actuator that takes commands"),
     ({"controller": jb.Feedback([1.0, 2.0])}, "controller.gains must list one gain for each of 1"),
-    ({"sensors": ()}, "controller.gains has 1 entries, but there are only 0 sensors"),
+    ({"sensors": ()}, "controller.gains has 1 entry, but there are only 0 sensors"),
     (
         {"controller": jb.Feedback([1.0], higher_gains=[[1.0, 2.0]])},
         "controller.higher_gains must have in each row a gain for each of 1 actuators, not 2",

@@ -164,7 +164,7 @@ REFUSED = [
     ("length = 0.6", "length = {}", "beam.length must be one number, not {}"),
     ("length = 0.6", "length = nan", "beam.length must be a finite number; it is nan"),
     ("0.03", '[0.03, "a"]', "beam.damping_ratio must be one number or a list of numbers, not"),
-    ("0.03", "[0.03]", "beam.damping_ratio lists 1 values for 3 modes"),
+    ("0.03", "[0.03]", "beam.damping_ratio lists 1 value for 3 modes"),
     ('"pinned-pinned"', "3", "beam.ends must be a word in quotes, not 3"),
     ("modes = 3", "modes = 3.0", "beam.modes must be a whole number, 1 or more; it is 3.0"),
     ("[[supports]]", "[supports]", "supports must be a list of tables; write [[supports]]"),

@@ -339,7 +339,7 @@ def test_figures_take_the_place_of_axes(record):
         record.plot(ax=Figure().add_axes((0, 0, 1, 1)))
     with pytest.raises(ValueError, match="no sensor measures 'strain'; they measure deflection"):
         record.plot("strain")
-    with pytest.raises(ValueError, match="labels names 1 sensors; the case has 2"):
+    with pytest.raises(ValueError, match="labels names 1 sensor; the case has 2"):
         record.plot(labels=["one"])
 
 

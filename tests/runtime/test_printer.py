@@ -19,6 +19,7 @@ from jaxbeam.analysis.sections import Envelope
 from jaxbeam.cli import main
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.printer import html_table, labelled_dataset, terminal_width, text_table
+from jaxbeam.runtime.progress import ProgressBar
 from tests.modules import DATA, ROOT
 from tuning.control.tuning_result import RunSetResult
 from tuning.parameters import FreeParameter
@@ -267,3 +268,12 @@ def test_no_package_of_other_arrays_is_imported():
         "assert not {'dask', 'pint', 'cupy', 'sparse'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_bar_counts_one_thing_in_the_singular(capsys):
+    for total, expected in ((None, ("fit: 1 point [", "fit: 2 points [")), (1, ("1/1 point [",))):
+        with ProgressBar(total, "point", shown=True, desc="fit", mininterval=0.0) as bar:
+            for _ in expected:
+                bar.update()
+        written = capsys.readouterr().err
+        assert all(words in written for words in expected), written

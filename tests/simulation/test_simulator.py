@@ -260,7 +260,7 @@ OTHERS = {
     ),
     "stiffer": (SPAN, jb.replace(SPAN, {"beam.flexural_rigidity": 1e6}), "too long"),
     "faster": (SPAN, jb.replace(SPAN, {"loads.0.speed": 40.0}), "too long"),
-    "together": (TWO, jb.replace(TWO, {"loads.1.entry_time": 0.05}), "at most 1 loads"),
+    "together": (TWO, jb.replace(TWO, {"loads.1.entry_time": 0.05}), "at most 1 load"),
     "duration": (SPAN, jb.replace(SPAN, {"run.duration": 0.3}), "61 samples from 0 to 0.3 s"),
     "sample rate": (SPAN, jb.replace(SPAN, {"run.sample_rate": 100.0}), "41 samples"),
 }

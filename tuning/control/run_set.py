@@ -28,6 +28,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.memory import block_memory
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
     common_plan,
@@ -204,7 +205,7 @@ def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
         if len(entries) != 2:
             raise ValueError(
                 f"{where}.{address} must be a range, low and high, to draw from; it has"
-                f" {len(entries)} entries"
+                f" {counted(len(entries), 'entry', 'entries')}"
             )
     try:
         return latin_hypercube(table, draw_options["draws"], draw_options.get("seed", 0))

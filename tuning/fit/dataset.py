@@ -19,6 +19,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.model.elements import largest_layout
 from jaxbeam.model.plausibility.check import check
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 from jaxbeam.simulation.integrator.time_grid import EventSchedule, stack_schedules
 from tuning.fit.least_squares import autocorrelation, autocorrelation_factor
@@ -98,7 +99,7 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
     if not 0 <= actuator < len(case.actuators):
         raise ValueError(
             f"{log.source}: {log.names[channel]} is the command to actuators.{actuator}, but the"
-            f" case has {len(case.actuators)} actuators, counted from 0"
+            f" case has {counted(len(case.actuators), 'actuator')}, counted from 0"
         )
     if log.actuators.count(actuator) > 1:
         raise ValueError(f"{log.source}: two of its channels are commands to actuators.{actuator}")

@@ -20,6 +20,7 @@ from scipy.stats import norm
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.modes import mesh_layout, modes
+from jaxbeam.runtime.printer import counted
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH, t_quantile, uncertainty
 from tuning.fit.result import ParameterEstimates, parameter_table
 from tuning.modal.result import ModalEstimates, mac_matrix
@@ -139,7 +140,8 @@ def identify_from_modes(
     frequencies, _, shapes = map(np.asarray, solved(start))
     if frequencies.size < len(identified.modes):
         raise ValueError(
-            f"the case has {frequencies.size} modes, {len(identified.modes)} were identified: "
+            f"the case has {counted(frequencies.size, 'mode')}, {len(identified.modes)} were"
+            " identified: "
             "raise beam.modes"
         )
     y = np.asarray(to_unbounded(parameters, start))

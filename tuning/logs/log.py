@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.fields import OUTSIDE, refuse_traced
 from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.runtime.printer import counted
 from tuning.logs.readers import LogTable, is_time_name, parse_heading
 from tuning.logs.units import is_of_time
 
@@ -113,7 +114,9 @@ class Log:
 
     def __repr__(self) -> str:
         """What was read: samples, duration, channels with units in the file and their sensors."""
-        lines = [f"Log {self.source}: {self.times.size} samples in {self.duration:.6g} s"]
+        lines = [
+            f"Log {self.source}: {counted(self.times.size, 'sample')} in {self.duration:.6g} s"
+        ]
         parts = {"sensor": self.sensors, "actuator": self.actuators, "at": self.positions}
         for i, channel in enumerate(zip(self.names, self.quantities, self.units, strict=True)):
             of_case = [f"{word} {own[i]:g}" for word, own in parts.items() if own[i] is not None]

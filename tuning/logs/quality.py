@@ -21,6 +21,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import resample_poly
 
 from jaxbeam.case.arguments import checks_classes
+from jaxbeam.runtime.printer import counted
 from tuning.logs.log import GAP_STEPS, Log, between_gaps
 from tuning.logs.units import STANDARD_GRAVITY
 
@@ -166,7 +167,7 @@ def find_faults(log: Log) -> list[Fault]:
     >>> times = 0.01 * np.arange(200)
     >>> values = np.where(times == 0.5, 9.0, np.sin(6 * times))[:, None]
     >>> print(*tuning.logs.find_faults(tuning.Log(times, values, ("d1",), ("deflection",), ("m",))))
-    log: d1 has spikes (one sample), first at t = 0.5 s
+    log: d1 has spikes (1 sample), first at t = 0.5 s
     """
     found = [*_gaps(log), *_clock_drift(log), *_offsets(log), *_held(log)]
     for i, name in enumerate(log.names):
@@ -201,7 +202,7 @@ def mask(log: Log, kinds: Sequence[str]) -> Log:
         if fault.kind in kinds:
             valid[fault.samples, log.names.index(fault.channel)] = False
             count = int(fault.samples.sum())
-            notes.append(f"{count} samples of {fault.channel} are left out ({fault.kind})")
+            notes.append(f"{counted(count, 'sample')} of {fault.channel} left out ({fault.kind})")
     return dataclasses.replace(log, valid=valid, notes=tuple(notes))
 
 
@@ -333,6 +334,6 @@ _SAMPLE_FAULTS = {
 
 def _message(log: Log, rule: _SampleFault, channel: str, samples) -> str:
     first, count = log.times[np.argmax(samples)], int(samples.sum())
-    number = f"{count} samples" if count > 1 else "one sample"
+    number = counted(count, "sample")
     what = rule.sentence.format(channel=channel, count=number)
     return f"{log.source}: {what}, first at t = {first:.6g} s"

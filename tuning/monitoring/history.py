@@ -20,6 +20,7 @@ from jaxtyping import Complex, Float, Int
 from jaxbeam.runtime.input_file import read_text_input
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import counted
 from jaxbeam.runtime.progress import ProgressBar
 from tuning.logs.log import LogWarning
 from tuning.logs.readers.headings import epoch_seconds
@@ -313,7 +314,9 @@ def read_conditions(path: str | os.PathLike) -> dict[str, dict[str, float]]:
         except ValueError:
             raise ValueError(f"{path}, line {number}: a condition is no number") from None
         if len(values) != len(head) - 1:
-            raise ValueError(f"{path}, line {number}: it has {len(row)} cells, not {len(head)}")
+            raise ValueError(
+                f"{path}, line {number}: it has {counted(len(row), 'cell')}, not {len(head)}"
+            )
         known[Path(row[0].strip()).as_posix()] = dict(
             zip(map(str.strip, head[1:]), values, strict=True)
         )

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.base import AbstractLoad, MovingMass
+from jaxbeam.runtime.printer import counted
 from tuning.fit.dataset import WHITENESS_SIGNIFICANCE, sensor_readings
 from tuning.fit.identify import identify
 from tuning.fit.least_squares import t_quantile
@@ -321,7 +322,7 @@ class Weighing:
         return {"loads": loads, "bic": counts, "verdict": self.fit.verdict}
 
     def __str__(self) -> str:
-        lines = [f"{_count_text(len(self.loads))} found"]
+        lines = [f"{counted(len(self.loads), 'load')} found"]
         lines += [f"BIC with {count.name}: {count.bic:.1f}" for count in self.load_counts]
         return "\n".join([*lines, str(self.fit)])
 
@@ -373,13 +374,13 @@ def weigh(
     fits: dict[str, Fit] = {}
     while True:
         count = len(found.loads)
-        fit = fits[_count_text(count)] = _fit_loads(case, log, found.loads)
+        fit = fits[counted(count, "load")] = _fit_loads(case, log, found.loads)
         if (
             min(channel.p_value for channel in fit.channel_residuals) > WHITENESS_SIGNIFICANCE
             or count >= max_count
         ):
             break
-        if len(fits) > 1 and compare_fits(fits)[0].name != _count_text(count):
+        if len(fits) > 1 and compare_fits(fits)[0].name != counted(count, "load"):
             break
         found = pursuit.find(count + 1)
     criteria = compare_fits(fits) if len(fits) > 1 else []
@@ -398,7 +399,3 @@ def _fit_loads(case: Case, log: Log, loads: list[MovingMass]) -> Fit:
         free[f"loads.{i}.entry_time"] = (-length / abs(speed), end)
     free |= {f"sensors.{i}.offset": None for i in range(len(case.sensors))}
     return identify(case, dataclasses.replace(log, loads=tuple(loads)), free)
-
-
-def _count_text(count: int) -> str:
-    return f"{count} load{'s' if count > 1 else ''}"

@@ -20,6 +20,7 @@ from jaxbeam.case.controller import commanded
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.numerics.qp import STATUS_TEXT, solve_qp
 from jaxbeam.runtime.arrays import Module
+from jaxbeam.runtime.printer import counted
 from jaxbeam.simulation.record import Record
 
 REGULARISATION = 1e-10  # on squared commands, of the largest effect of one: some have no effect
@@ -101,7 +102,8 @@ def least_integral(
     given = np.ones(positions.size) if weights is None else np.asarray(weights, float)
     if given.shape != positions.shape or not np.all(given >= 0) or not np.any(given):
         raise ValueError(
-            f"weights must list {positions.size} numbers, not negative and not all zero, one a"
+            f"weights must list {counted(positions.size, 'number')}, not negative and not all"
+            " zero, one a"
             f" position; they are {given.tolist()}"
         )
     low, high, change = held_command_limits(case, period)

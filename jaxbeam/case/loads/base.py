@@ -39,6 +39,7 @@ from jaxbeam.case.trajectory import (
     TabulatedTrajectory,
 )
 from jaxbeam.runtime.arrays import Array, Module, Number, cholesky, solve, xp
+from jaxbeam.runtime.printer import counted
 
 _LOAD_TOLERANCE = 1e-9  # of the mean wheel load: a smaller one carries nothing
 
@@ -194,7 +195,8 @@ class AbstractLoad(ReprWithUnits):
         time_count, position_count = self.times.shape[0], self.positions.shape[0]
         if time_count != position_count:
             return (
-                f"{address} has {time_count} times and {position_count} positions;"
+                f"{address} has {counted(time_count, 'time')} and"
+                f" {counted(position_count, 'position')};"
                 " a table needs one position for each time"
             )
         if time_count < 2:
@@ -339,7 +341,8 @@ def length_error(address: str, part: Any, first: str, names: tuple[str, ...]) ->
         if value is None or not np.ndim(value) or np.shape(value)[0] == expected:
             continue
         return (
-            f"{address}.{name} has {np.shape(value)[0]} entries and {first} has {expected};"
+            f"{address}.{name} has {counted(np.shape(value)[0], 'entry', 'entries')} and"
+            f" {first} has {expected};"
             " give one for each axle, front first"
         )
     return None

@@ -11,6 +11,7 @@ import jaxbeam as jb
 from jaxbeam.case.toml_file import read_toml
 from jaxbeam.cli.arguments import check_exists, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, DrawingOptions, Output, Over, table
+from jaxbeam.runtime.printer import counted
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.bound.bound import Bound
@@ -121,7 +122,7 @@ def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     runs = load_cases.held_out or load_cases.training
     comparisons = compare_runs(case, laws, runs, period)
     overall = metrics_over_cases(comparisons)
-    lines = [f"over {len(runs)} runs of {path}:", *_overall_table(overall)]
+    lines = [f"over {counted(len(runs), 'run')} of {path}:", *_overall_table(overall)]
     for name in overall:
         worst = worst_comparison(comparisons, name)
         where = ", ".join(f"{address} = {value:.4g}" for address, value in runs[worst].items())

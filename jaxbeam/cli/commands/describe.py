@@ -11,6 +11,7 @@ from jaxbeam.cli.options import (
     PrintOptions,
     table,
 )
+from jaxbeam.runtime.printer import counted
 
 if TYPE_CHECKING:
     from jaxbeam.case.case import Case
@@ -273,7 +274,7 @@ def _list_library(options: PrintOptions) -> None:
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]
-    rows += [(name, f"{len(train.offsets)} axles") for name, train in trains().items()]
+    rows += [(name, f"{counted(len(train.offsets), 'axle')}") for name, train in trains().items()]
     rows += [(name, "line load") for name in line_loads()]
     width = max(len(name) for name, _ in rows)
     options.report(

@@ -24,6 +24,7 @@ from jaxbeam.cli.options import (
     table,
 )
 from jaxbeam.runtime.output_file import RESULTS
+from jaxbeam.runtime.printer import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -296,7 +297,7 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
             run = _run_of_largest(sign * peaks)
             row = (sensor.name or i, f"{sensor.quantity}{unit}", words, f"{peaks[run]:.6g}")
             rows.append((*row, f"{times[run]:.6g}", *_swept_values(results, run, addresses)))
-    runs = f"{failed.size} runs, {failed.sum()} failed"
+    runs = f"{counted(failed.size, 'run')}, {failed.sum()} failed"
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]

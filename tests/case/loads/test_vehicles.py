@@ -328,7 +328,7 @@ def test_case_files_keep_every_number(kind, tmp_path):
         (
             "half-car",
             {"tyre_damping": [1.0]},
-            "tyre_damping has 1 entries and axle_positions has 2",
+            "tyre_damping has 1 entry and axle_positions has 2",
         ),
         ("half-car", {"tyre_stiffness": [1e6, 0.0]}, r"tyre_stiffness.1 must be positive: without"),
         (

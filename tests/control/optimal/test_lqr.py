@@ -122,7 +122,7 @@ def test_intervals_needed_follow_from_the_modes_of_the_design():
         (LQR([1.0] * 6, [1.0]), "state_weight must have 7 entries, not 6"),
         (LQR([1.0] * 7, [0.0]), "command_weight.0 must be positive"),
         (LQR([-1.0] * 7, [1.0]), "state_weight.0 must not be negative"),
-        (LQR([1.0] * 7, [1.0, 1.0]), "command_weight must have 1 entries"),
+        (LQR([1.0] * 7, [1.0, 1.0]), "command_weight must have 1 entry"),
         (LQR([1.0] * 7, [1.0], positions=[0.3]), "positions and position_weight belong"),
         (
             LQR([1.0] * 7, [1.0], positions=[0.9], position_weight=[1.0]),
@@ -238,7 +238,7 @@ def test_the_integral_stands_still_beyond_the_limits():
         ({"reference": [0.0, 0.0]}, "integral_weight must have an entry for each of 2 reference"),
         (
             {"reference": [0.0, 0.0], "integral_weight": [1.0, 1.0]},
-            "reference must have at most 1 entries",
+            "reference must have at most 1 entry",
         ),
         ({"delay": 0.01}, "delay must be less than the period"),
     ],

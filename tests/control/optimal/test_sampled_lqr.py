@@ -246,7 +246,7 @@ def test_slow_sampling_warns(tmp_path, capsys):
     [
         ({}, "controller.period must be given"),
         ({"period": 1e-3, "delay": 1e-3}, "controller.delay must be less than the period"),
-        ({"period": 1e-3, "input_rate_weight": [1.0, 1.0]}, "must have 1 entries, not 2"),
+        ({"period": 1e-3, "input_rate_weight": [1.0, 1.0]}, "must have 1 entry, not 2"),
     ],
 )
 def test_errors_of_settings(options, message):

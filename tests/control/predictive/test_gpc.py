@@ -266,7 +266,7 @@ def test_a_delay_that_the_design_lacks():
     [
         ({"forgetting": 1.1}, "forgetting must be at most 1"),
         ({"probe": [0.5]}, "probe needs a time to end: give until"),
-        ({"probe": [0.5, 1.0], "until": 0.2}, "probe must have 1 entries, not 2"),
+        ({"probe": [0.5, 1.0], "until": 0.2}, "probe must have 1 entry, not 2"),
     ],
 )
 def test_errors(settings, message):

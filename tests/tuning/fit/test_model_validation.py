@@ -445,4 +445,4 @@ def test_remarks_on_priors_and_on_logs():
     fitted = fit(least_squares(measured=measured, free=dict.fromkeys(TRUTH) | prior))
     remarks = "\n".join(fitted.remarks)
     assert "beam.damping_ratio is determined by its prior more than by the logs" in remarks
-    assert "run 1: w has spikes (one sample), first at t = 1.2 s (not masked)" in remarks
+    assert "run 1: w has spikes (1 sample), first at t = 1.2 s (not masked)" in remarks

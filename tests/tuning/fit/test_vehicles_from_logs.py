@@ -180,7 +180,7 @@ def test_descriptions_name_sensors_on_vehicles(tmp_path, crossing):
 def test_sensors_of_no_vehicle_are_refused():
     sensor = case().vehicle_sensors[0]
     for change, words in (
-        ({"load": 1}, "vehicle_sensors.0.load is 1, but the case has 1 loads, counted from 0"),
+        ({"load": 1}, "vehicle_sensors.0.load is 1, but the case has 1 load, counted from 0"),
         ({"body": "bogie"}, "is no body of loads.0; they are body, axle"),
         ({"vehicle": 1}, "vehicle_sensors.0.vehicle is 1, but loads.0 has 1 in a row"),
         ({"position": np.array(1.0)}, "the body of loads.0 does not pitch; leave it out"),

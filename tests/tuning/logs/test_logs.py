@@ -359,7 +359,7 @@ def test_masking_is_on_request_and_noted():
     log = changed(100, 3.0, changed(slice(400, 500), 0.123))
     masked = mask(log, ["spikes"])
     assert np.flatnonzero(~masked.valid[:, 0]).tolist() == [100] and masked.valid[:, 1].all()
-    assert masked.notes == ("1 samples of a are left out (spikes)",)
+    assert masked.notes == ("1 sample of a left out (spikes)",)
     np.testing.assert_array_equal(masked.values, log.values)
     assert [fault.kind for fault in find_faults(masked)] == ["stuck"]
     assert np.sum(~mask(masked, ["stuck"]).valid) == 101

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.runtime.input_file import check_input, describe_content, read_input
+from jaxbeam.runtime.printer import counted
 from tuning.logs.units import UNITS_OF_CONDITIONS, is_unit
 
 # Names, in small letters, of numbers stored with the channels that define their times.
@@ -431,7 +432,10 @@ def check_widths(
     """Check that each row has a cell for each column. Raises ValueError, naming the line."""
     for row, line in zip(rows, lines, strict=True):
         if len(row) != len(names):
-            raise ValueError(f"{path}, line {line}: {len(row)} cells for {len(names)} columns")
+            raise ValueError(
+                f"{path}, line {line}: {counted(len(row), 'cell')} for"
+                f" {counted(len(names), 'column')}"
+            )
 
 
 def check_last_line(
