@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+import jaxbeam as jb
 from jaxbeam.model.modes import modes
 from jaxbeam.model.plausibility import loads, structure
 from jaxbeam.model.plausibility.facts import Facts, plausible_numbers
@@ -439,3 +440,21 @@ def test_values_are_those_of_closed_forms(quantity, base, changes, expected):
     assert found.keys() == expected.keys()
     for address, value in expected.items():
         assert_allclose(found[address], value, rtol=2e-4, atol=1e-12, err_msg=address)
+
+
+def test_a_beam_on_soft_springs_is_held():
+    """Statics of a beam on a spring at each end, much softer than the beam, and its bounce."""
+    length, rigidity, density, k, force = 25.0, 30e12, 15e3, 1e5, 170e3
+    case = jb.Case(
+        jb.Beam(length, rigidity, density, ends="free-free", damping_ratio=0.01, modes=6),
+        supports=[jb.Support(x, stiffness=k) for x in (0.0, length)],
+        loads=[jb.MovingForce(force=force, speed=10.0)],
+        run=jb.Run(4.0),
+    )
+    found = plausible_numbers(case, modes(case))
+    weight = density * G
+    own = weight * (length / (2 * k) + 5 * length**4 / (384 * rigidity))
+    assert_allclose(found.own_deflection, own, rtol=1e-4)
+    assert_allclose(found.deflection, force / k, rtol=1e-4)  # below a force at an end
+    bounce = math.sqrt(2 * k / (density * length)) / (2 * math.pi)
+    assert_allclose(found.first_frequency, bounce, rtol=1e-4)

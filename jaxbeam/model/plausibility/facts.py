@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.beam import END_CONDITIONS, Support, segment_edges
 from jaxbeam.case.case import Case, crossing_times
@@ -84,7 +84,7 @@ class Plausibility:
 
 def plausible_numbers(case: Case, found: Modes) -> Plausibility:
     """Characteristic numbers of a concrete case with its modes, without warnings."""
-    frequencies = found.frequencies[found.stiffness > 1e-9 * found.stiffness_unit]
+    frequencies = found.frequencies[is_elastic(found)]
     first = float(frequencies[0]) if frequencies.size else None
     span = _longest_span(case)
     loads = load_set(dataclasses.replace(case, absorbers=()))
@@ -106,14 +106,19 @@ def _longest_span(case: Case) -> float:
     return max(right - left for left, right in itertools.pairwise(marks))
 
 
+def is_elastic(found: Modes) -> Bool[np.ndarray, " mode"]:
+    """Whether modes are held by a stiffness, and are not motions as a rigid body."""
+    return np.asarray(found.stiffness > 1e-9 * found.stiffness_unit)
+
+
 def compliance(found: Modes) -> Float[np.ndarray, " mode"]:
     """Inverse of the stiffness of modes; zero for motions as a rigid body."""
-    elastic = found.stiffness > 1e-9 * found.stiffness_unit
+    elastic = is_elastic(found)
     return np.where(elastic, 1 / np.where(elastic, found.stiffness, 1.0), 0.0)
 
 
 def _is_held(found: Modes) -> bool:
-    return bool(np.all(compliance(found) > 0))
+    return bool(np.all(is_elastic(found)))
 
 
 def _under_loads(
@@ -294,8 +299,7 @@ class Facts:
     @functools.cached_property
     def frequencies(self) -> np.ndarray:
         """Elastic natural frequencies (Hz); none of a beam without stiffness."""
-        elastic = self.modes.stiffness > 1e-9 * self.modes.stiffness_unit
-        return np.asarray(self.modes.frequencies)[elastic]
+        return np.asarray(self.modes.frequencies)[is_elastic(self.modes)]
 
     @functools.cached_property
     def windows(self) -> np.ndarray:

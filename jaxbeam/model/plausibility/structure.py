@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.model.plausibility.facts import Facts, compliance
+from jaxbeam.model.plausibility.facts import Facts, compliance, is_elastic
 from jaxbeam.model.state_space import poles
 
 INF = math.inf
@@ -391,7 +391,7 @@ def frequency_off_modes(facts):
     Hartog with the mass ratio mu of the mode, or of a force: they may miss it by 40 %. One that
     fits better as rad/s may miss by 5 %, that of positive position feedback, too: these are 1.
     """
-    elastic = facts.modes.stiffness > 1e-9 * facts.modes.stiffness_unit
+    elastic = is_elastic(facts.modes)
     forced = [float(f) for _, load in facts.loads("varying-force") for f in load.frequencies]
     forced += [float(load.pace) for _, load in facts.loads("pedestrian", "crowd")]
     found = []
