@@ -426,3 +426,19 @@ def test_derivatives_of_a_free_beam_by_springs_of_zero_stiffness():
         values = [np.asarray(function(n * h * jnp.eye(2)[i])) for n in range(4)]
         expected = (-11 * values[0] + 18 * values[1] - 9 * values[2] + 2 * values[3]) / (6 * h)
         assert_allclose(found[:, i], expected, rtol=1e-6)
+
+
+def test_a_dataset_of_shapes_reaches_from_end_to_end():
+    """The first mode of two equal spans is that of a pinned span, once up and once down."""
+    length, rigidity, density = 24.0, 5e9, 8e3
+    beam = Beam(length, rigidity, density, damping_ratio=0.02, modes=2)
+    found = modes(Case(beam, supports=[Support(length / 2)], run=jb.Run(1.0))).to_xarray(9)
+    x, wave = np.linspace(0.0, length, 9), 2 * np.pi / length
+    assert_allclose(found.position, x, rtol=1e-15)
+    sine = np.sqrt(2 / (density * length)) * np.sin(wave * x)
+    assert_allclose(found["shape"][:, 0], sine, rtol=0, atol=1e-9 * np.abs(sine).max())
+    assert_allclose(
+        found.frequency[0], wave**2 * np.sqrt(rigidity / density) / (2 * np.pi), rtol=1e-9
+    )
+    assert_allclose(found.damping_ratio, 0.02, rtol=1e-9)
+    assert found.mode.values.tolist() == [1, 2]
