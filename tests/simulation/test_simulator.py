@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.simulation.integration_plan import common_plan, integration_plan
 from jaxbeam.simulation.integrator import step_size
+from jaxbeam.simulation.integrator.step_size import ErrorFloor
 from jaxbeam.simulation.simulate import simulate_histories, simulate_readings
 from tests.differences import central
 
@@ -369,6 +370,21 @@ def test_a_controlled_run_names_one_too():
     )
     with pytest.raises(RuntimeError, match="in double precision it agrees to"):
         jb.simulate(controlled, tolerance=1e-14)
+
+
+@pytest.mark.parametrize(("error", "sixteenth"), [(0.5e-11, True), (0.49e-11, False)])
+def test_an_error_is_rounding_where_a_sixteenth_of_the_step_has_not_halved_it(error, sixteenth):
+    floor = ErrorFloor(1e-13)
+    floor.check(1e-11, 1.0)
+    floor.check(0.9e-11, 1 / 15.9)  # the next step may still lessen it
+    if sixteenth:
+        with pytest.raises(RuntimeError, match="agrees to 1.0e-11; give a tolerance of 4e-11 or"):
+            floor.check(error, 1 / 16)
+    else:
+        floor.check(error, 1 / 16)
+    floor = ErrorFloor(1e-13)
+    for step in (1.0, 1e-3):
+        floor.check(2e-9, step)  # too large to be rounding
 
 
 def deflection_under_a_limited_spring(gain: float, limit: float) -> float:
