@@ -552,8 +552,7 @@ class Beam(ReprWithUnits):
         if ratio_shape and ratio_shape != (self.modes,):
             return (
                 f"{address}.damping_ratio lists {counted(ratio_shape[0], 'value')} for"
-                f" {self.modes} modes;"
-                " give one for each mode, or a single number for all"
+                f" {self.modes} modes; give one for each mode, or a single number for all"
             )
         given = []
         if is_concrete(self.damping_ratio) and concrete(self.damping_ratio).any():

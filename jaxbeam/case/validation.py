@@ -365,8 +365,7 @@ def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> No
     if sensor.load >= len(case.loads):
         raise ValueError(
             f"{address}.load is {sensor.load}, but the case has"
-            f" {counted(len(case.loads), 'load')}, counted"
-            " from 0"
+            f" {counted(len(case.loads), 'load')}, counted from 0"
         )
     load = case.loads[sensor.load]
     names = load.vehicle(case.run.gravity).names

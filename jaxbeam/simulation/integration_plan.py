@@ -144,8 +144,7 @@ def check_origin(
     if own.max_loads > shapes.max_loads:
         raise ValueError(
             f"the plan was made for at most {counted(shapes.max_loads, 'load')} on the beam"
-            " at once, and there"
-            f" are {own.max_loads}: {INSTEAD}"
+            f" at once, and there are {own.max_loads}: {INSTEAD}"
         )
     ratio = origin.max_stable_step / float(model_limits(case, own.layout)[0])
     unstable = ratio * steps_per_limit > max(1.0, steps_per_limit) * (1 + 1e-9)

@@ -363,8 +363,7 @@ def record_html(case: Case, times, verdict: str, extremes: Extremes) -> str:
 def _head(case: Case, times) -> str:
     times = np.asarray(times)
     parts = [f"{counted(times.size, 'sample')} to {times[-1]:.4g} s"]
-    for count, word in ((len(case.sensors), "sensor"), (len(case.loads), "load")):
-        parts.append(f"{count} {word}{'s' * (count != 1)}")
+    parts += [counted(len(case.sensors), "sensor"), counted(len(case.loads), "load")]
     head = f"Record of {case.title!r}" if case.title else "Record"
     return f"{head}: {', '.join(parts)}"
 

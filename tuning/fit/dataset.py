@@ -174,7 +174,7 @@ def _check_known(log: Log, numbers: list[int], name: str, count: int) -> None:
 
 
 def _mismatch(log: Log, count: int, name: str = "sensors") -> ValueError:
-    listed = f"{count} {name}" if count != 1 else f"one {name.removesuffix('s')}"
+    listed = counted(count, name.removesuffix("s"))
     key = name.replace(" ", "_").removesuffix("s")
     return ValueError(
         f"{log.source}: its channels {', '.join(log.names)} do not match the case's {listed}; "

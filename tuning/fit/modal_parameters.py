@@ -141,8 +141,7 @@ def identify_from_modes(
     if frequencies.size < len(identified.modes):
         raise ValueError(
             f"the case has {counted(frequencies.size, 'mode')}, {len(identified.modes)} were"
-            " identified: "
-            "raise beam.modes"
+            " identified: raise beam.modes"
         )
     y = np.asarray(to_unbounded(parameters, start))
     pairs = _paired(identified, frequencies, shapes, places is not None)

@@ -280,13 +280,13 @@ def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ..
         records.append(EvenRecord(float(times[0]), values))
     if not records:
         raise ValueError(
-            f"{log.source}: after {len(parts) - 1} gaps no record has {MIN_RECORD_SAMPLES} samples"
+            f"{log.source}: after {counted(len(parts) - 1, 'gap')} no record has"
+            f" {MIN_RECORD_SAMPLES} samples"
         )
     if len(parts) > 1:
         used = "1 record is used" if len(records) == 1 else f"{len(records)} records are used"
         less = f", {dropped} of less than {MIN_RECORD_SAMPLES} samples left out" if dropped else ""
-        many = "1 gap" if len(parts) == 2 else f"{len(parts) - 1} gaps"
-        notes.append(f"{many}: {used}{less}")
+        notes.append(f"{counted(len(parts) - 1, 'gap')}: {used}{less}")
     if resampled:
         notes.append(
             f"times are up to {resampled:.2g} steps off an even grid of {step:.6g} s: interpolated"

@@ -86,7 +86,7 @@ def sensor_readings(log: Log) -> Log:
         none = unread(log.values[:, i]) & valid[:, i]
         if none.any():
             valid[none, i] = False
-            many = f"{none.sum()} samples" if none.sum() > 1 else "one sample"
+            many = counted(none.sum(), "sample")
             notes.append(
                 f"{name} reads 0 in {many}, as if its sensor did not answer: interpolated{OPTION}"
             )
@@ -334,6 +334,5 @@ _SAMPLE_FAULTS = {
 
 def _message(log: Log, rule: _SampleFault, channel: str, samples) -> str:
     first, count = log.times[np.argmax(samples)], int(samples.sum())
-    number = counted(count, "sample")
-    what = rule.sentence.format(channel=channel, count=number)
+    what = rule.sentence.format(channel=channel, count=counted(count, "sample"))
     return f"{log.source}: {what}, first at t = {first:.6g} s"

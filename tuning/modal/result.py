@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jaxbeam.runtime.printer import TableViews, text_table
+from jaxbeam.runtime.printer import TableViews, counted, text_table
 from tuning.logs.log import Log
 
 
@@ -136,7 +136,7 @@ class ModalEstimates(TableViews):
     @property
     def headline(self) -> str:
         """Title of the modes, with the name of their source."""
-        return f"{len(self.modes)} mode{'s' * (len(self.modes) != 1)} of {self.source}"
+        return f"{counted(len(self.modes), 'mode')} of {self.source}"
 
     @property
     def columns(self) -> dict[str, np.ndarray]:

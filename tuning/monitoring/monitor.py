@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from jaxbeam.case.arguments import checks_classes
 from jaxbeam.plot.style import ALARM, GREY, LIMIT_STYLE, colour, use_style
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.runtime.printer import TableViews, text_table
+from jaxbeam.runtime.printer import TableViews, counted, text_table
 from tuning.logs.readers.headings import epoch_seconds
 from tuning.monitoring.history import (
     MAX_STEP,
@@ -349,9 +349,9 @@ class Monitoring(TableViews):
         entries, chart = self.history.entries, self.chart
         if not self.tracks:
             return f"no mode is found in enough of {len(entries)} logs to be followed"
-        followed = f"{len(self.tracks)} mode{'s' * (len(self.tracks) > 1)} followed in"
+        followed = f"{counted(len(self.tracks), 'mode')} followed in"
         followed = "; ".join(
-            [f"{followed} {len(entries)} logs", *self._undated, *self.come_and_gone]
+            [f"{followed} {counted(len(entries), 'log')}", *self._undated, *self.come_and_gone]
         )
         if chart is None:
             return (

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.runtime.printer import text_table
+from jaxbeam.runtime.printer import counted, text_table
 from tuning.fit.dataset import sensor_readings
 from tuning.logs.log import Log
 from tuning.weighing.axle_fit import (
@@ -439,7 +439,7 @@ class AxleWeighing:
         (gross, error), (by_moses, moses_error) = fit.gross_weight, self.moses.gross_weight
         criteria = ", ".join(f"{n}: {value:.1f}" for n, value in self.bic.items())
         lines = [
-            f"{count} axle{'s' * (count > 1)} found, at {fit.geometry.speed:.4g} m/s",
+            f"{counted(count, 'axle')} found, at {fit.geometry.speed:.4g} m/s",
             *text_table(header, rows, ">>><><"),
             f"gross weight {gross / 1e3:.5g} kN, standard error {error / 1e3:.3g} kN; by"
             f" Moses' method {by_moses / 1e3:.5g} kN, standard error {moses_error / 1e3:.3g} kN",

@@ -26,7 +26,7 @@ from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.output_rows import sensor_rows, static_correction
 from jaxbeam.model.sensor_signals import needs_times, sampled_readings
-from jaxbeam.runtime.printer import text_table
+from jaxbeam.runtime.printer import counted, text_table
 
 STEPS_PER_CROSSING = 200
 STEPS_PER_PERIOD = 12  # of the highest mode
@@ -282,7 +282,7 @@ class InfluenceLines(NamedTuple):
             f" {self.dynamic_share:.2g} of the static ones"
         )  # fmt: skip
         count = self.values.shape[1]
-        first = f"influence lines of {count} sensor{'s' * (count > 1)}{about}"
+        first = f"influence lines of {counted(count, 'sensor')}{about}"
         return "\n".join([first, *text_table(head, rows, ">>>>")])
 
     def to_dict(self) -> dict:

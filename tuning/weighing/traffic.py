@@ -23,7 +23,7 @@ from jaxbeam.case.fields import refuses_traced
 from jaxbeam.runtime.input_file import read_text_input
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.runtime.printer import TableViews, text_table
+from jaxbeam.runtime.printer import TableViews, counted, text_table
 from jaxbeam.runtime.progress import ProgressBar
 from tuning.fit.dataset import sensor_readings
 from tuning.logs.log import Log, LogWarning
@@ -143,7 +143,7 @@ class WeighedTraffic(TableViews):
         right = sum(one.speed > 0 for one in self.vehicles)
         doubted = sum(bool(one.doubt) for one in self.vehicles)
         return (
-            f"{count} vehicle{'s' * (count > 1)}, {right} from the left and {count - right} from"
+            f"{counted(count, 'vehicle')}, {right} from the left and {count - right} from"
             f" the right, of {weights.min():.4g} to {weights.max():.4g} kN"
             + f"; {doubted} with a doubt"
             * bool(doubted)

@@ -103,8 +103,7 @@ def least_integral(
     if given.shape != positions.shape or not np.all(given >= 0) or not np.any(given):
         raise ValueError(
             f"weights must list {counted(positions.size, 'number')}, not negative and not all"
-            " zero, one a"
-            f" position; they are {given.tolist()}"
+            f" zero, one a position; they are {given.tolist()}"
         )
     low, high, change = held_command_limits(case, period)
     for i, actuator in enumerate(case.actuators):

@@ -196,8 +196,7 @@ class AbstractLoad(ReprWithUnits):
         if time_count != position_count:
             return (
                 f"{address} has {counted(time_count, 'time')} and"
-                f" {counted(position_count, 'position')};"
-                " a table needs one position for each time"
+                f" {counted(position_count, 'position')}; a table needs one position for each time"
             )
         if time_count < 2:
             return f"{address}.times needs at least two points; it has {time_count}"
@@ -342,8 +341,7 @@ def length_error(address: str, part: Any, first: str, names: tuple[str, ...]) ->
             continue
         return (
             f"{address}.{name} has {counted(np.shape(value)[0], 'entry', 'entries')} and"
-            f" {first} has {expected};"
-            " give one for each axle, front first"
+            f" {first} has {expected}; give one for each axle, front first"
         )
     return None
 

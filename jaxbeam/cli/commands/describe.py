@@ -106,7 +106,7 @@ def _beam_words(case: "Case") -> str:
     from jaxbeam.case.display import with_prefix
 
     beam, count = case.beam, len(case.supports)
-    held = f", {count} support{'s' * (count > 1)} between" if count else ""
+    held = f", {counted(count, 'support')} between" if count else ""
     rigidity = with_prefix(float(beam.bending_stiffness), "N m^2", 6)
     return (
         f"beam of {float(beam.length):.6g} m, {beam.ends}{held}: E I = {rigidity},"
@@ -274,7 +274,7 @@ def _list_library(options: PrintOptions) -> None:
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]
-    rows += [(name, f"{counted(len(train.offsets), 'axle')}") for name, train in trains().items()]
+    rows += [(name, counted(len(train.offsets), "axle")) for name, train in trains().items()]
     rows += [(name, "line load") for name in line_loads()]
     width = max(len(name) for name, _ in rows)
     options.report(

@@ -18,6 +18,7 @@ from jaxbeam.cli.options import (
     table,
 )
 from jaxbeam.runtime.output_file import TABLES
+from jaxbeam.runtime.printer import counted
 
 ZERO = 1e-5  # fraction of the largest value of a quantity that is printed as 0
 
@@ -383,5 +384,5 @@ def check(case: Path, /, *, options: ReadingOptions = ReadingOptions()) -> None:
     found = jb.check(options.read(case, judged=""))
     print_warnings(found)
     number = len(found.warnings)
-    words = "nothing looks wrong" if not number else f"{number} warning{'s' * (number > 1)}"
+    words = "nothing looks wrong" if not number else counted(number, "warning")
     options.report(jb.api.content(found), [f"plausibility: {found}", words])

@@ -48,14 +48,14 @@ export function svg(tag, attributes = {}, ...children) {
 let pressed = false;
 /** @type {Set<() => void>} */ const waiting = new Set();
 
-/** @param {PointerEvent} event */
+/** @param {MouseEvent} event */
 function press(event) {
-  if (event.button === 0) pressed = event.type === "pointerdown";
+  pressed = event.type === "pointerdown" && event.button === 0;
   if (!pressed) setTimeout(() => { // after the click
     for (const work of pressed ? [] : waiting) waiting.delete(work) && work();
   });
 }
-for (const kind of /** @type {const} */ (["pointerdown", "pointerup", "pointercancel"])) globalThis.addEventListener?.(kind, press, true);
+for (const kind of /** @type {const} */ (["pointerdown", "pointerup", "pointercancel", "contextmenu"])) globalThis.addEventListener?.(kind, press, true);
 
 /**
  * Work that waits while a button is pressed: what is drawn anew between a press and its release
