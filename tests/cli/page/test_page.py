@@ -342,13 +342,18 @@ def test_nothing_is_wider_than_the_window(page, width):
     assert wide == []
 
 
-def test_a_map_fills_and_a_cell_opens_its_run(page):
+def test_a_map_fills_between_presses_and_a_cell_opens_its_run(page):
     page.get_by_role("tab", name="Sweep").click()
     page.get_by_label("Over", exact=True).select_option("loads.0.speed")
     page.get_by_label("and over").select_option("loads.0.mass")
     page.get_by_label("values").nth(0).fill("4")
     page.get_by_label("values").nth(1).fill("3")
-    page.get_by_role("button", name="Sweep", exact=True).click()
+    page.mouse.move(5, 5)
+    page.mouse.down()
+    page.get_by_role("button", name="Sweep", exact=True).press("Enter")
+    page.wait_for_timeout(2500)
+    assert page.locator(".cell").count() == 0
+    page.mouse.up()
     wait_for(lambda: page.locator(".cell:enabled").count() == 12, 120)
     assert "--over loads.0.speed=0.5:2.0:4" in page.locator(".sweep .code").inner_text()
     page.locator(".cell").first.focus()

@@ -1,7 +1,7 @@
 // Work that takes long: begun, followed, stopped.
 
 import { ask } from "./api.js";
-import { html } from "./dom.js";
+import { html, released } from "./dom.js";
 
 const PAUSE = 200; // ms between questions
 
@@ -30,6 +30,7 @@ export function createJob(store, words, begin, seen) {
       let known = 0;
       for (;;) {
         const state = await ask("job", { job: number, known, name: store.name });
+        await new Promise((go) => released(() => go(null))());
         known = seen(state);
         const [done, total] = state.progress;
         if (state.seen?.rows !== undefined) bar.value = known / Math.max(1, state.seen.values[state.seen.rows]?.length ?? 1);
